@@ -1,8 +1,8 @@
 """The solution that most edges agree with, and the probability that each edge is right, given that solution.
 
 Growing pieces best first can take a place for another that looks like it, and from there no single move leads back. So
-where every pair was tried, a second start uses only the edges between consecutive views, which are wrong more rarely.
-The local search begins at both, the pieces of both then grow into one another, and the solution with the larger
+a second start begins with the paths of consecutive views, which are wrong more rarely. Where every pair was tried, the
+local search begins at both, the pieces of both then grow into one another, and the solution with the larger
 log-evidence is taken.
 """
 
@@ -19,8 +19,6 @@ from hodge_pipeline.diagnosis.placement import arrangement_log_evidence
 from hodge_pipeline.diagnosis.robust_poses import ANNEALED, GATE, LARGE, ONCE, TWICE, Fit, fit
 from hodge_pipeline.diagnosis.scene_model import learn_scene_model
 from hodge_pipeline.diagnosis.search import LARGEST, searched
-from hodge_pipeline.solvers.backbone.chain import linear_forest, make_chain, sequential_edges
-from hodge_pipeline.solvers.backbone.trust import COVERED, FEWEST_STEPS
 from hodge_pipeline.types import Floats
 
 PRIOR_SHARE = 0.25
@@ -40,15 +38,12 @@ def find_consensus(evidence: Evidence) -> tuple[Fit, Floats]:
 
 
 def best_arrangement(evidence: Evidence, start: Fit) -> Fit:
-    """The arrangement with the largest log-evidence, from `start` and, where it is informative, the order; `start`
-    itself where there are too many views.
+    """The arrangement with the largest log-evidence, from `start` and from the order; `start` itself where there are
+    too many views.
     """
     if not 2 < evidence.graph.vertex_count <= LARGEST:
         return start
-    starts = [start]
-    if np.ptp(evidence.prior) > 0:
-        chain = evidence.select(np.flatnonzero(np.abs(evidence.graph.edges[:, 1] - evidence.graph.edges[:, 0]) == 1))
-        starts.append(fit(evidence, fit(chain, align(chain), ONCE), TWICE))
+    starts = start, fit(evidence, _in_order(evidence), TWICE)
     found = [fit(evidence, align(evidence, searched(evidence, begun)), ONCE) for begun in starts]
     models = [learn_scene_model(evidence, one) for one in found]
     values = [sum(arrangement_log_evidence(evidence, one, model) for model in models) for one in found]
@@ -70,29 +65,23 @@ def _one_of_each_series(best: Fit, evidence: Evidence) -> Fit:
 
 def _mended(evidence: Evidence, grown: Alignment) -> Fit:
     """The solution that grown pieces lead to where the order tells nothing of pairs that were tried."""
-    graph, best = evidence.graph, fit(evidence, grown, ANNEALED, rough=True)
+    graph, best = evidence.graph, fit(evidence, grown, ANNEALED)
     # a ring of many edges hides a whole turn, which no descent undoes and chordal rotations have not
     best = min((fit(evidence, best, (GATE,), initial=name) for name in ("given", "chordal")), key=_misfit)
     if graph.edge_count > LARGE:  # one exact solve is all that there is time for
         return best
-    if not best.used.all() and (ordered := _in_order(evidence)) is not None:
-        roughly = fit(evidence, ordered, ANNEALED, rough=True)
+    if not best.used.all():
+        roughly = fit(evidence, _in_order(evidence), ANNEALED)
         best = min(best, fit(evidence, roughly, (GATE,)), key=_misfit)
     return searched(evidence, best)
 
 
-def _in_order(evidence: Evidence) -> Alignment | None:
-    """The alignment that begins with the paths of consecutive edges; None where these are too few for a sequence. Where
-    a chain hangs by one end and by wrong edges, no cycle tells that it is these.
+def _in_order(evidence: Evidence) -> Alignment:
+    """The alignment that begins with the paths of consecutive edges: where a chain hangs by one end and by wrong edges,
+    no cycle tells that it is these.
     """
-    graph = evidence.graph
-    steps = sequential_edges(graph)
-    if steps.sum() < max(FEWEST_STEPS, COVERED * graph.vertex_count):
-        return None
-    chain = make_chain(graph, linear_forest(graph.edges, graph.vertex_count, steps))
-    piece, poses = np.empty(chain.size, np.int64), np.empty((chain.size, 4, 4))
-    piece[chain.order], poses[chain.order] = chain.path, chain.poses
-    return align(evidence, Alignment(piece, poses))
+    steps = np.abs(evidence.graph.edges[:, 1] - evidence.graph.edges[:, 0]) == 1
+    return align(evidence, align(evidence.select(np.flatnonzero(steps))))
 
 
 def _misfit(found: Fit) -> float:

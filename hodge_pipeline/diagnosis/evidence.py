@@ -19,7 +19,7 @@ FAR_SHARE = 0.25
 LEAST_ODDS = 2.0
 """Of neighbours in order to be joined, in units of those of far pairs, for the order to count."""
 DOUBTED = 2
-SHARE_ROUNDS = 30
+ROUNDS = 30
 FEW = 20
 """Edges of a gap at which the usual share of right edges weighs as much as their own."""
 TRIED_FROM = 0.1
@@ -28,6 +28,12 @@ CYCLES_PER_EDGE = 64
 """Triangles kept to an edge, so that memory is bounded."""
 LEAST_DEGREE = 4
 """Mean number of edges at a view."""
+FARTHEST = 2.0
+"""Of the median translation: a point further off is a turning circle, not something that is seen."""
+LEAST_GAIN = 0.3
+"""Share of the median translation that a point must save."""
+TIE_BREAK = 1e-3
+"""Of a weight: with equal ones a chain would be joined one edge a round."""
 
 
 def order_prior(edges: Ints, vertex_count: int) -> Floats:
@@ -64,7 +70,7 @@ def prior_by_cycles(edges: Ints, vertex_count: int, cycles: Cycles) -> Floats:
     sides = place[cycles.loops.select(triangles).edge.reshape(-1, 3)]
     closing = np.bincount(sides.ravel(), np.repeat(cycles.closes[triangles], 3), len(bounds))
     share = np.full(len(bounds), 0.5)
-    for _ in range(SHARE_ROUNDS):
+    for _ in range(ROUNDS):
         others = share[sides[:, [1, 0, 0]]] * share[sides[:, [2, 2, 1]]]
         expected = np.bincount(sides.ravel(), others.ravel(), len(bounds))
         observed = np.clip(closing / np.maximum(expected, 1e-9), FLOOR, CEILING)
@@ -87,7 +93,7 @@ def right_by_gap(edges: Ints, vertex_count: int, cycles: Cycles, usual: float) -
     passes = np.bincount(place[cycles.loops.edge], minlength=len(bounds))
     number = np.bincount(place, minlength=len(bounds))
     share = np.full(len(bounds), min(usual, CEILING))
-    for _ in range(SHARE_ROUNDS):
+    for _ in range(ROUNDS):
         # of a cycle that fails at least one edge is wrong (expectation), and each in its share of them (maximisation)
         close = np.exp(np.bincount(row, np.log(share)[entry], len(loops)))
         wrong = np.bincount(entry, ((1 - share)[entry] / (1 - close[row])), len(bounds))
@@ -125,14 +131,6 @@ def _pairs(low: int, high: int, count: int) -> int:
     """Pairs of vertices whose gap is in [low, high)."""
     high = min(high, count)
     return 0 if high <= low else (high - low) * count - (high * (high - 1) - low * (low - 1)) // 2
-
-
-ROUNDS = 20
-FARTHEST = 2.0
-"""Of the median translation: a point further off is a turning circle, not something that is seen."""
-LEAST_GAIN = 0.3
-TIE_BREAK = 1e-3
-"""Of a weight: with equal ones a chain would be joined one edge a round."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Align a scene from its edges: pieces are merged greedily, those with the largest log-evidence first.
 
-Each round every piece picks the neighbour with the largest log-evidence and is merged with it (Borůvka's scheme for
-trees). Edges between two
+Each round every piece picks the neighbour with the largest log-evidence and is merged with it, unless that neighbour
+has much better merges of its own to come (Borůvka's scheme for trees, with patience). Edges between two
 pieces are votes on where one lies in the other. Once joined, all edges of both vote together, so that long cycles are
 tested without ever being listed. No edge is trusted: one that agrees with no other is left out.
 """
@@ -18,12 +18,14 @@ from hodge_pipeline.diagnosis.cycles import GATE
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.types import Bools, Floats, Ints
 
+PATIENCE = 0.7
+"""Of the best score that a piece has: weaker merges wait, since more edges may then vote on their placement."""
 HYPOTHESES = 24
 """Votes of a pair of pieces, the weightiest, that are tried as the answer."""
 MOST_PAIRS_TO_A_VOTE = 400
-CLUSTER_GAIN = 2.0
-"""Nats that agreeing edges between two pieces add per e-fold of their number: they are one event, since places that
-look alike give many wrong edges that agree."""
+PER_FOLD = 2.0
+"""Nats that agreeing edges between two sets of views add per e-fold of their number: they are one event, since places
+that look alike give many wrong edges that agree."""
 DRIFT = 0.25
 """Of an edge's variance, for each usual edge length between two votes: pieces are not solved while they grow."""
 
@@ -67,19 +69,20 @@ def _gains(evidence: Evidence, votes: Votes) -> Floats:
     strength = votes.agreement * weight[votes.edge[votes.vote]]
     counted = votes.agreement * np.minimum(1.0, 0.5 + weight[votes.edge[votes.vote]])
     gain = np.bincount(votes.hypothesis, strength, size)
-    return np.asarray(gain + CLUSTER_GAIN * np.log1p(np.bincount(votes.hypothesis, counted, size)))
+    return np.asarray(gain + PER_FOLD * np.log1p(np.bincount(votes.hypothesis, counted, size)))
 
 
 def _joins(votes: Votes, gain: Floats, count: int) -> tuple[Ints, Bools]:
     """The hypotheses to join by, and whether it is the lower of the two pieces that moves.
 
-    A piece moves to the one with the largest log-evidence, if that one stays where it is in this round.
+    A piece moves to the one with the largest log-evidence, if that one stays where it is in this round and has no much
+    better join of its own to wait for.
     """
     order = np.lexsort((-gain, votes.pair))
     best = order[votes.start]
     real = np.flatnonzero(gain[best] > 0)
     real = real[np.lexsort((real, -gain[best][real]))]
-    low, high = votes.low[real], votes.high[real]
+    low, high, score = votes.low[real], votes.high[real], gain[best][real]
     first = np.full(count, len(real))
     np.minimum.at(first, low, np.arange(len(real)))
     np.minimum.at(first, high, np.arange(len(real)))
@@ -87,7 +90,7 @@ def _joins(votes: Votes, gain: Floats, count: int) -> tuple[Ints, Bools]:
     has_moved, base = np.zeros(count, bool), np.zeros(count, bool)
     for row in np.unique(first[first < len(real)]).tolist():
         for mover, other, lower in ((high[row], low[row], False), (low[row], high[row], True)):
-            wanted = first[mover] == row
+            wanted = first[mover] == row and score[row] >= PATIENCE * score[first[other]]
             if wanted and not (has_moved[mover] or base[mover] or has_moved[other]):
                 has_moved[mover] = base[other] = True
                 chosen.append(real[row])
@@ -101,7 +104,7 @@ class Votes:
 
     - `edge (N,)`, `low_from_high (N, 4, 4)`: where the edge puts the piece of higher number; `point (N, 3)`: the end
       of the edge in that piece.
-    - `pair (N,)`: row of the pair of pieces; `low`, `high (P,)`: their numbers; `start`, `count (P,)`: its votes.
+    - `pair (N,)`: row of the pair of pieces; `low`, `high (P,)`: their numbers; `start (P,)`: its first vote.
     - `hypothesis`, `vote (M,)`: rows that were compared; `agreement (M,)` from 1 down to 0 at the gate.
     """
 
@@ -112,7 +115,6 @@ class Votes:
     low: Ints
     high: Ints
     start: Ints
-    count: Ints
     hypothesis: Ints
     vote: Ints
     agreement: Floats
@@ -136,7 +138,7 @@ def collect_votes(evidence: Evidence, piece: Ints, piece_from: Floats) -> Votes 
     hypothesis, vote = _compared(pair.reshape(-1), start, count)
     agreement = agreement_of(evidence, edge, motion, point, hypothesis, vote)
     low, high = names // evidence.graph.vertex_count, names % evidence.graph.vertex_count
-    return Votes(edge, motion, point, pair.reshape(-1), low, high, start, count, hypothesis, vote, agreement)
+    return Votes(edge, motion, point, pair.reshape(-1), low, high, start, hypothesis, vote, agreement)
 
 
 def _compared(pair: Ints, start: Ints, count: Ints) -> tuple[Ints, Ints]:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.cycles import Loops
-from hodge_pipeline.complex.judging import has_unit_information, mean_variances
+from hodge_pipeline.complex.judging import MEDIAN_CHI2, has_unit_information, mean_variances
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
-MAXWELL_MEDIAN = 1.538
+MAXWELL_MEDIAN = math.sqrt(MEDIAN_CHI2[3])
 DEFAULT_ANGLE_RAD = 0.03
 DEFAULT_SHARE = 0.05
 """Of an edge's usual length: its error where too few cycles close to estimate it."""
@@ -23,6 +24,12 @@ LONGEST_CYCLE = 4
 FEWEST_CYCLES, SOME_CYCLES = 20, 4
 COPIES = 1e-5
 """Of the gate: cycles that close so exactly join copies of one measurement, and are no evidence."""
+STATED = 3.0
+"""Standard deviations of the graph's own information that explain a cycle."""
+NEARLY_ALL = 0.95
+MAXWELL_NEARLY_ALL = 2.795
+GAP = 5.0
+"""Of the error that nearly all cycles that close stay below."""
 HEAVY_TAILS = 1.9
 """Errors of registration have heavier tails than a Gaussian of the same median."""
 LEAST_CREDIBLE, MOST_CREDIBLE, TOLD_FROM = 0.2, 2.5, 2.0
@@ -68,8 +75,10 @@ def edge_noise(
     """The noise of each edge: the information `there`, of the graph at the working point, gives the proportions, and
     cycles that close give the scale.
 
-    Where too few cycles close to estimate it, the information is believed within bounds: errors as large as the motions
-    would let any loop close, and errors as small as those of rounding none.
+    Where the information explains nearly all of these, the scale does so too: edges of several kinds make long tails,
+    and their stated information fits the cycles. Where too few cycles close to estimate it, the information is believed
+    within bounds: errors as large as the motions would let any loop close, and errors as small as those of rounding
+    none.
     """
     rotation, translation, informed = _proportions(graph, there)
     short = np.flatnonzero(loops.lengths <= LONGEST_CYCLE)
@@ -80,6 +89,11 @@ def edge_noise(
     believed = tuple(map(_credible, stated, usual, (turned.shown(), shifted.shown())))
     turn = turned.scale(FIRST_GATE_RAD, prior, believed[0] if informed else usual[0])
     shift = shifted.scale(FIRST_GATE_SHARE * reach_m, prior, believed[1] if informed else usual[1])
+    closes = (turned.error < FIRST_GATE_RAD) & (shifted.error < FIRST_GATE_SHARE * reach_m)
+    sound = (turned.ratio < STATED) & (shifted.ratio < STATED)
+    if informed and closes.sum() >= FEWEST_CYCLES and sound[closes].mean() >= NEARLY_ALL:
+        turn = max(turn, turned.scale_of_nearly(sound, closes))
+        shift = max(shift, shifted.scale_of_nearly(sound, closes))
     if not informed:
         shift = max(shift, LEVER * turn * reach_m)
     taken = turn == believed[0], shift == believed[1]
@@ -158,3 +172,11 @@ class _Errors:
         if len(self.ratio) < SOME_CYCLES:
             return 0.0
         return HEAVY_TAILS * float(np.median(self.ratio)) / MAXWELL_MEDIAN
+
+    def scale_of_nearly(self, sound: Bools, closes: Bools) -> float:
+        """The scale that explains nearly all cycles that the information does (L,), unless a gap parts them from those
+        that close (L,): stated errors that are far too large would explain wrong edges too.
+        """
+        told = self.ratio[closes & (self.ratio > COPIES)]
+        limit = GAP * float(np.quantile(told, NEARLY_ALL)) if len(told) else np.inf
+        return float(np.quantile(self.ratio[sound & (self.ratio < limit)], NEARLY_ALL)) / MAXWELL_NEARLY_ALL

@@ -19,12 +19,11 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.complex.judging import squares_at_both_ends
 from hodge_pipeline.diagnosis.evidence import Evidence
+from hodge_pipeline.diagnosis.growth import PER_FOLD
 from hodge_pipeline.diagnosis.robust_poses import UNSETTLED, Fit
 from hodge_pipeline.diagnosis.scene_model import SceneModel
 from hodge_pipeline.types import Bools, Floats, Ints
 
-PER_FOLD = 2.0
-"""Nats for each e-fold of agreeing edges."""
 FAIR_SHARE, SHARE_SPREAD = 0.75, 0.35
 """Of the edges expected under a placement, the share from which on it has evidence in its favour, and its spread."""
 ROUNDING = 1e-9

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.judging import FREEDOM, left_over, squares_at_both_ends
+from hodge_pipeline.complex.judging import FREEDOM, STUDENT_99, left_over, squares_at_both_ends
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import Alignment
 from hodge_pipeline.solvers.minimise import descend_isotropic
@@ -17,7 +17,7 @@ from hodge_pipeline.solvers.resistance import Network, effective_resistance
 from hodge_pipeline.solvers.setup import InitialName, prepare
 from hodge_pipeline.types import Bools, Floats, Ints
 
-GATE, UNSETTLED = 90.0, 60.0
+GATE, UNSETTLED = STUDENT_99[6], 60.0
 """An edge of a larger χ² has no part in the poses, the second while these are not settled."""
 ONCE, TWICE = (UNSETTLED,), (UNSETTLED, GATE)
 ANNEALED = (1e4, 1e3, 300.0)
@@ -50,26 +50,19 @@ class Fit(Alignment):
         return self.used & np.isinf(self.resistance)
 
 
-def fit(
-    evidence: Evidence,
-    alignment: Alignment,
-    gates: tuple[float, ...],
-    *,
-    rough: bool = False,
-    initial: InitialName = "given",
-) -> Fit:
+def fit(evidence: Evidence, alignment: Alignment, gates: tuple[float, ...], initial: InitialName = "given") -> Fit:
     """The robust solution that an alignment leads to: for each gate in turn, the edges of a smaller χ² are solved.
 
-    `rough`: quickly and with errors as large as each gate allows, which leads near it whatever the drift. `initial`:
-    the poses that each solve begins at, the alignment's or chordal ones of the edges of its gate.
+    For gates wider than GATE quickly and with errors as large as the gate allows, which leads near it whatever the
+    drift. `initial`: the poses that each solve begins at, the alignment's or chordal ones of the edges of its gate.
     """
     apart = np.not_equal(*alignment.piece[evidence.graph.edges.T])
     found = _judged(evidence, alignment.poses, alignment.piece, ~apart, 0.0)
-    for gate, following in zip(gates, (*gates[1:], GATE if rough else math.inf), strict=True):
+    for gate, following in zip(gates, (*gates[1:], GATE if gates[-1] > GATE else math.inf), strict=True):
         used = found.chi2 < gate
         if following < gate and np.array_equal(used, found.chi2 < following):
             continue
-        widened = gate / GATE if rough else 1.0
+        rough, widened = gate > GATE, max(gate / GATE, 1.0)
         first = found.chi2 / widened if rough else np.full(len(used), DIMENSION)
         limits = QUICKLY if rough or len(used) > LARGE else FULLY
         poses, squares = _solve(evidence, found.poses, used, first, limits, widened, initial)

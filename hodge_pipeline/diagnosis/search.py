@@ -16,8 +16,8 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.growth import Alignment, agreement_of, mean_motions
-from hodge_pipeline.diagnosis.placement import PER_FOLD, Placements, consecutive_log_evidence, log_evidence
+from hodge_pipeline.diagnosis.growth import PER_FOLD, Alignment, agreement_of, mean_motions
+from hodge_pipeline.diagnosis.placement import Placements, consecutive_log_evidence, log_evidence
 from hodge_pipeline.diagnosis.robust_poses import ONCE, Fit, fit
 from hodge_pipeline.diagnosis.scene_model import learn_scene_model
 from hodge_pipeline.types import Bools, Floats, Ints
