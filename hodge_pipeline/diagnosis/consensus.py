@@ -28,10 +28,18 @@ edges of 90 simulated rings, corridors and streets and 16 rooms, and of nine gra
 EXTREME = 0.01
 
 
-def find_consensus(evidence: Evidence) -> tuple[Fit, Floats]:
-    """The solution that most edges agree with, and the probability (E,) that each edge is right, given it."""
+def find_consensus(evidence: Evidence, start: Floats | None = None) -> tuple[Fit, Floats]:
+    """The solution that most edges agree with, and the probability (E,) that each edge is right, given it. Where not
+    every pair was tried, it is sought from poses `start (V, 4, 4)` too.
+    """
     grown = align(evidence)
-    best = best_arrangement(evidence, fit(evidence, grown, TWICE)) if evidence.exhaustive else _mended(evidence, grown)
+    if evidence.exhaustive:
+        best = best_arrangement(evidence, fit(evidence, grown, TWICE))
+    else:
+        best = _mended(evidence, grown)
+        if start is not None:
+            other = Alignment(np.zeros(len(start), np.int64), start)
+            best = min(best, fit(evidence, fit(evidence, other, ANNEALED), (GATE,)), key=_misfit)
     best = _one_of_each_series(best, evidence)
     agreeing = np.sqrt(np.maximum(0.0, 1 - best.chi2 / GATE))
     return best, _with_prior(agreeing, evidence.prior)

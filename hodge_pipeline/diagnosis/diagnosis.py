@@ -59,14 +59,21 @@ def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbo
     if backbone is not None and not backbone.doubted:
         return backbone
     found = _by_cycles(graph, options)
-    return (backbone_anyway(graph, found.kept, backbone) if options.trust == AUTO else None) or found
+    if options.trust != AUTO:
+        return found
+    backbone, explains_more = backbone_anyway(graph, found.kept, backbone)
+    if backbone is None or explains_more:
+        return backbone or found
+    # groups of wrong loops may have torn what its poses hold together
+    return _by_cycles(graph, options, backbone.world_from_cam)
 
 
-def _by_cycles(stated: ViewGraph, options: DiagnosisOptions) -> Diagnosis:
-    """The diagnosis that trusts no edge."""
+def _by_cycles(stated: ViewGraph, options: DiagnosisOptions, start: Floats | None = None) -> Diagnosis:
+    """The diagnosis that trusts no edge, sought also from poses (V, 4, 4) where `start` gives them."""
     graph, turned = in_vertex_order(stated)
     evidence, cycles, point = gather(graph, options)
-    fit, agreeing = find_consensus(evidence)
+    there = se3.from_parts(np.eye(3), point)
+    fit, agreeing = find_consensus(evidence, None if start is None else start @ there)
     cycles = _with_witnesses(cycles, fit.used, evidence)
     blame = share_blame(cycles, fit, evidence)
     unvouched = blame.unvouched & (agreeing >= LIKELIER_RIGHT)
@@ -77,7 +84,7 @@ def _by_cycles(stated: ViewGraph, options: DiagnosisOptions) -> Diagnosis:
     wrong = probability < WRONG_BELOW
     verdict = np.select([untestable, right, wrong], [UNTESTABLE, CONSISTENT, WRONG], SUSPECT)
     kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
-    world_from_cam = fit.poses @ se3.inverse(se3.from_parts(np.eye(3), point))
+    world_from_cam = fit.poses @ se3.inverse(there)
     cycles = replace(cycles, loops=cycles.loops.reversed_edges(turned))
     telling = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
     found = Diagnosis.of(

@@ -22,20 +22,20 @@ of mistaken places, these are up to 2.3 times as many, but for four of the graph
 """
 
 
-def backbone_anyway(graph: ViewGraph, kept: Bools, doubted: Backbone | None = None) -> Backbone | None:
+def backbone_anyway(graph: ViewGraph, kept: Bools, doubted: Backbone | None = None) -> tuple[Backbone | None, bool]:
     """The backbone of a lattice or a room of which edges `kept (E,)` leave out steps that nothing near these
-    contradicts, where it confirms loops of more places than they keep in its stead, or none; None elsewhere. One that
-    is `doubted` also where they leave out too many steps for a backbone that is wrong.
+    contradicts, None elsewhere; and whether it confirms loops of more places than they keep in its stead, or none. One
+    that is `doubted` also where they leave out too many steps for a backbone that is wrong.
     """
     from_afar, out, steps = contradicted_from_afar(graph, kept)
     hidden = doubted is not None and out > MOST_WRONG * steps
     if from_afar < max(FROM_AFAR * out, 1) and not hidden:
-        return None
+        return None, False
     backbone = doubted or find_backbone(graph, anyway=True)
     if backbone is None:
-        return None
+        return None, False
     for_it, against = backbone.places(backbone.used & ~kept), backbone.places(kept & ~backbone.used)
     if (doubted or not backbone.found.confirmed) and against < OF_BACKBONE * out:
-        return backbone
+        return backbone, True
     worth = OF_BACKBONE if is_tested(backbone.chain) else 1.0
-    return backbone if backbone.found.confirmed and worth * for_it > against else None
+    return backbone, backbone.found.confirmed and worth * for_it > against
