@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import Alignment, align
@@ -26,6 +27,8 @@ PRIOR_SHARE = 0.25
 edges of 90 simulated rings, corridors and streets and 16 rooms, and of nine graphs of real fragments.
 """
 EXTREME = 0.01
+EVERY = 1e9
+"""A gate that lets every edge pass."""
 
 
 def find_consensus(evidence: Evidence, start: Floats | None = None) -> tuple[Fit, Floats]:
@@ -79,8 +82,9 @@ def _mended(evidence: Evidence, grown: Alignment) -> Fit:
     if graph.edge_count > LARGE:  # one exact solve is all that there is time for
         return best
     if not best.used.all():
-        roughly = fit(evidence, _in_order(evidence), ANNEALED)
-        best = min(best, fit(evidence, roughly, (GATE,)), key=_misfit)
+        whole = Alignment(connected_components(graph.edges, graph.vertex_count), best.poses)
+        for start in (_in_order(evidence), fit(evidence, whole, (EVERY,), "chordal")):
+            best = min(best, fit(evidence, fit(evidence, start, ANNEALED), (GATE,)), key=_misfit)
     return searched(evidence, best)
 
 
