@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from tests.backbone_graphs import at_one_place, broken, drive, round_trip
+from hodge_pipeline.types import ViewGraph
+from tests.backbone_graphs import Drive, at_one_place, broken, drive, round_trip
 from tests.test_backbone import NEVER_WORSE
 
 
@@ -65,3 +67,23 @@ def test_a_lattice_whose_odometry_is_wrong_at_many_steps_needs_none() -> None:
     assert made.error_m(found.world_from_cam) < 0.2
     wrong = np.flatnonzero((np.diff(graph.edges, axis=1)[:, 0] == 1) & (graph.edges[:, 0] % 12 == 5))
     assert not found.kept[wrong].any()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_fifth_of_the_edges_of_a_lattice_are_wrong(seed: int) -> None:
+    """Rows walked to and fro, each joined to the next: growing alone ended 15 m off."""
+    rng, k = np.random.default_rng([seed, 200, 20]), np.arange(200)
+    row, along = k // 20, k % 20
+    back = row % 2 == 1
+    place = np.stack([np.where(back, 19 - along, along), row, 0 * k], axis=1).astype(float)
+    truth = se3.from_parts(se3.so3_exp(np.outer(np.where(back, np.pi, 0.0), [0.0, 0, 1])), place)
+    i, j = np.triu_indices(200, 1)
+    edges = np.stack([i, j], axis=1)[np.linalg.norm(place[i] - place[j], axis=1) < 1.05]
+    exact = se3.inverse(truth[edges[:, 0]]) @ truth[edges[:, 1]]
+    motions = exact @ se3.exp(rng.normal(size=(len(edges), 6)) * np.repeat([0.01, 0.04], 3))
+    wrong = rng.random(len(edges)) < 0.2
+    motions[wrong] = motions[wrong] @ se3.exp(rng.normal(0, 1, (int(wrong.sum()), 6)))
+    made = Drive(ViewGraph.from_edges(k, edges, motions), truth, ~wrong)
+    found = diagnose(made.graph)
+    assert made.error_m(found.world_from_cam) < 1.0
+    assert (found.kept & wrong).sum() <= 10

@@ -1,9 +1,10 @@
 """The solution that most edges agree with, and the probability that each edge is right, given that solution.
 
 Growing pieces best first can take a place for another that looks like it, and from there no single move leads back. So
-a second start begins elsewhere. Where every pair was tried, with the paths of consecutive views, which are wrong more
-rarely: the local search begins at both, the pieces of both then grow into one another, and the solution with the larger
-log-evidence is taken. Elsewhere with chordal poses of all edges, from which those that do not follow fall out.
+a second start begins with the paths of consecutive views, which are wrong more rarely. Where every pair was tried, the
+local search begins at both, the pieces of both then grow into one another, and the solution with the larger
+log-evidence is taken. Elsewhere a third one begins with chordal poses of all edges, from which those that do not follow
+fall out.
 """
 
 from __future__ import annotations
@@ -83,8 +84,8 @@ def _mended(evidence: Evidence, grown: Alignment) -> Fit:
         return best
     if not best.used.all():
         whole = Alignment(connected_components(graph.edges, graph.vertex_count), best.poses)
-        start = fit(evidence, whole, (EVERY,), "chordal")
-        best = min(best, fit(evidence, fit(evidence, start, ANNEALED), (GATE,)), key=_misfit)
+        for start in (_in_order(evidence), fit(evidence, whole, (EVERY,), "chordal")):
+            best = min(best, fit(evidence, fit(evidence, start, ANNEALED), (GATE,)), key=_misfit)
     return searched(evidence, best)
 
 
