@@ -28,12 +28,12 @@ def simulated(seed: int, wrong: float | None = None) -> tuple[str, ViewGraph, Bo
     poses = _walk(kind, int(rng.integers(30, 90)), rng)
     pairs = _right_pairs(poses, int(rng.integers(1, 5)), float(rng.uniform(0.3, 4)), rng)
     errors = rng.standard_t(4, (len(pairs), 6)) if rng.integers(2) else rng.normal(size=(len(pairs), 6))
-    motions = _between(poses, pairs) @ se3.exp(errors * SIGMA)
+    motions = between(poses, pairs) @ se3.exp(errors * SIGMA)
     share = float(rng.choice(WRONG_SHARES)) if wrong is None else wrong
     count = int(share / (1 - share) * len(pairs))
     more, bad = _groups(poses, count, rng) if rng.integers(2) else _random(poses, count, rng)
     edges, motion = np.concatenate([pairs, more]), np.concatenate([motions, bad])
-    off = np.abs(se3.log(se3.inverse(motion) @ _between(poses, edges)))
+    off = np.abs(se3.log(se3.inverse(motion) @ between(poses, edges)))
     right = (off < RIGHT_SIGMAS * SIGMA).all(axis=1)
     return kind, ViewGraph.from_edges(np.arange(len(poses)), edges, motion), np.asarray(right)
 
@@ -70,7 +70,7 @@ def _right_pairs(poses: Floats, reach: int, loops: float, rng: np.random.Generat
     return np.stack([i, j], axis=1)[chosen]
 
 
-def _between(poses: Floats, pairs: Ints) -> Floats:
+def between(poses: Floats, pairs: Ints) -> Floats:
     return np.asarray(se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]])
 
 
@@ -79,7 +79,7 @@ def _random(poses: Floats, count: int, rng: np.random.Generator) -> tuple[Ints, 
     pairs, other = rng.integers(0, len(poses), (2, count, 2))
     turned = se3.exp(np.concatenate([rng.normal(0, 0.7, (count, 3)), np.zeros((count, 3))], axis=1))
     proper = pairs[:, 0] != pairs[:, 1]
-    return pairs[proper], (_between(poses, other) @ turned)[proper]
+    return pairs[proper], (between(poses, other) @ turned)[proper]
 
 
 def _groups(poses: Floats, count: int, rng: np.random.Generator) -> tuple[Ints, Floats]:

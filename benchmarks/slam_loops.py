@@ -73,6 +73,14 @@ def robotcar(folder: Path, graph: ViewGraph) -> tuple[Floats, Floats]:
     return places, np.abs(apart - np.linalg.norm(graph.i_from_j[:, :3, 3], axis=1))
 
 
+def odometry(graph: ViewGraph) -> Floats:
+    """The poses (V, 4, 4) of the consecutive edges alone."""
+    chain = make_chain(graph, linear_forest(graph.edges, graph.vertex_count, sequential_edges(graph)))
+    poses = np.empty((graph.vertex_count, 4, 4))
+    poses[chain.order] = chain.poses
+    return poses
+
+
 def timed(call: Callable[[], Floats], places: Floats, runs: int) -> tuple[float, float]:
     """The medians over the runs of the position error in metres and of CPU seconds."""
     errors, seconds = [], []
@@ -89,9 +97,6 @@ def line(
 ) -> dict[str, Any]:
     """One row of the table."""
     loops, right = ~consecutive(graph) & np.isfinite(off_m), off_m < limit_m
-    chain = make_chain(graph, linear_forest(graph.edges, graph.vertex_count, sequential_edges(graph)))
-    bare = np.empty((graph.vertex_count, 4, 4))
-    bare[chain.order] = chain.poses
     found = diagnose(graph)
     error, seconds = timed(lambda: diagnose(graph).world_from_cam, places, runs)
     used = found.kept & loops
@@ -101,7 +106,7 @@ def line(
         "graph": name,
         "loops": int(loops.sum()),
         "right": int((right & loops).sum()),
-        "odometry_m": position_error(bare[:, :3, 3], places),
+        "odometry_m": position_error(odometry(graph)[:, :3, 3], places),
         "diagnosis_m": error,
         "cpu_s": seconds,
         "used": int(used.sum()),

@@ -8,7 +8,8 @@
     python -m benchmarks.wrong_loops lattices --seed 1   # cylinders and grids with 1 to 20 % of all edges wrong
 
 Errors are metres RMS of positions after a rigid fit: to the truth, or for graphs of the literature to their own
-certified optimum without the injected loops. `--only WORD` takes the graphs whose name has the word.
+solution without the injected loops. WORSE: than 1.02 × the odometry. `--only WORD` takes the graphs whose name has
+the word.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from simulated_edges import _between as between
-from slam_loops import BICOCCA_M, ROBOTCAR_M, SHARED, bicocca, position_error, robotcar
+from edges_peers import consecutive as steps
+from simulated_edges import between
+from slam_loops import BICOCCA_M, ROBOTCAR_M, SHARED, bicocca, odometry, position_error, robotcar
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.refine.pose_graph import read_graph
-from hodge_pipeline.solvers.backbone.chain import linear_forest, make_chain, sequential_edges
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
@@ -83,16 +84,11 @@ def load(path: Path) -> ViewGraph:
     return graph
 
 
-def with_edges(graph: ViewGraph, edges: Ints, motions: Floats, information: Floats | None = None) -> ViewGraph:
-    """The graph with these edges (N, 2), motions (N, 4, 4), put behind its own."""
+def with_edges(graph: ViewGraph, edges: Ints, motions: Floats) -> ViewGraph:
+    """The graph with these edges (N, 2), motions (N, 4, 4), put behind its own, of their usual information."""
     both = np.concatenate([graph.edges, edges]), np.concatenate([graph.i_from_j, motions])
-    if information is None:
-        information = np.broadcast_to(np.median(graph.information, axis=0), (len(edges), 6, 6))
+    information = np.broadcast_to(np.median(graph.information, axis=0), (len(edges), 6, 6))
     return ViewGraph.from_edges(graph.vertex_ids, *both, information=np.concatenate([graph.information, information]))
-
-
-def steps(graph: ViewGraph) -> Bools:
-    return np.asarray(np.abs(graph.edges[:, 1] - graph.edges[:, 0]) == 1)
 
 
 def wrong_loops(
@@ -278,13 +274,6 @@ def lattice_cases(seed: int) -> Iterator[Case]:
                 yield Case(f"{kind} of {count}, {share:.0%} wrong", graph, place, ~bad)
 
 
-def odometry(graph: ViewGraph) -> Floats:
-    chain = make_chain(graph, linear_forest(graph.edges, graph.vertex_count, sequential_edges(graph)))
-    poses = np.empty((graph.vertex_count, 4, 4))
-    poses[chain.order] = chain.poses
-    return poses
-
-
 KINDS = {
     "random": random_cases,
     "breaks": broken_cases,
@@ -313,15 +302,13 @@ def main() -> None:
         alone = right_alone(case)
         false, lost = int((found.kept & ~case.right).sum()), int((~found.kept & case.right).sum())
         total, kept, blamed = total + seconds, kept + false, blamed + lost
-        bad = error > MORE * max(bare, alone)
+        bad = error > MORE * bare
         worse += bad
         wrong = int((~case.right).sum())
         cells = case.name, f"{len(case.right)}, {wrong}", f"{bare:.2f}", f"{alone:.2f}", f"{error:.2f}"
         print(" | ".join((*cells, f"{false}, {lost}", f"{seconds:.1f}")), "WORSE" if bad else "", flush=True)
     counts = f"{kept} wrong edges kept, {blamed} right ones not"
-    print(
-        f"{len(cases)} graphs, {total:.0f} CPU s; {counts}; {worse} worse than the odometry and than right edges alone"
-    )
+    print(f"{len(cases)} graphs, {total:.0f} CPU s; {counts}; {worse} worse than the odometry")
 
 
 def right_alone(case: Case) -> float:

@@ -22,7 +22,7 @@ from hodge_pipeline.solvers.backbone.sparse import Network
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import ViewGraph
-from tests.backbone_graphs import Drive, at_one_place, drive, round_trip
+from tests.backbone_graphs import Drive, drive, round_trip
 
 NEVER_WORSE = 1.02
 
@@ -135,23 +135,6 @@ def test_where_all_loops_are_wrong_the_backbone_comes_back(dimension: int, in_gr
     assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
     assert any("100 loops that nothing confirms" in note for note in found.notes)
     assert not np.isin(found.verdict[made.right], ("wrong", "suspect")).any()
-
-
-@pytest.mark.parametrize(("name", "seed"), [("short", 1), ("short", 4), ("few", 2)])
-def test_loops_between_places_at_random_are_used_by_chance_nowhere(data_dir: Path, name: str, seed: int) -> None:
-    """Of so many, some few lie near by chance, and agree with each other."""
-    graph = read_graph(data_dir / f"pose_graphs/slam_loops/robotcar/{name}/graph.g2o").graph
-    assert graph is not None
-    rng, edges = np.random.default_rng(seed), graph.edges.copy()
-    loops = np.flatnonzero(np.abs(np.diff(edges, axis=1)[:, 0]) != 1)
-    edges[loops] = np.sort([rng.choice(graph.vertex_count, 2, replace=False) for _ in loops], axis=1)
-    backbone = find_backbone(replace(graph, edges=edges))
-    assert backbone is not None and not backbone.used[loops].any()
-
-
-def test_one_loop_of_two_hundred_that_chance_explains_is_not_used() -> None:
-    made = at_one_place(drive(seed=0, dimension=3, loops=1, wrong=0.0), 200, seed=0)
-    assert not (diagnose(made.graph).kept & ~made.right).any()
 
 
 MISLEADING = [

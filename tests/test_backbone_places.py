@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, linearise
+from hodge_pipeline.solvers.backbone.trust import find_backbone
 from tests.backbone_graphs import Drive, at_one_place, drive
 from tests.test_backbone import NEVER_WORSE, chain_of
 from tests.test_solver_robust import rings, spoiled
@@ -71,3 +75,20 @@ def test_a_lattice_with_wrong_steps_is_judged_by_its_cycles(spans: str, share: f
     assert found.kept[wrong].sum() <= 1 + 0.2 * wrong.sum()  # some are the only edges of a vertex that may be right
     assert found.kept[~wrong].mean() > 0.99
     assert Drive(graph, truth, ~wrong).error_m(found.world_from_cam) < 0.5
+
+
+@pytest.mark.parametrize(("name", "seed"), [("short", 1), ("short", 4), ("few", 2)])
+def test_loops_between_places_at_random_are_used_by_chance_nowhere(data_dir: Path, name: str, seed: int) -> None:
+    """Of so many, some few lie near by chance, and agree with each other."""
+    graph = read_graph(data_dir / f"pose_graphs/slam_loops/robotcar/{name}/graph.g2o").graph
+    assert graph is not None
+    rng, edges = np.random.default_rng(seed), graph.edges.copy()
+    loops = np.flatnonzero(np.abs(np.diff(edges, axis=1)[:, 0]) != 1)
+    edges[loops] = np.sort([rng.choice(graph.vertex_count, 2, replace=False) for _ in loops], axis=1)
+    backbone = find_backbone(replace(graph, edges=edges))
+    assert backbone is not None and not backbone.used[loops].any()
+
+
+def test_one_loop_of_two_hundred_that_chance_explains_is_not_used() -> None:
+    made = at_one_place(drive(seed=0, dimension=3, loops=1, wrong=0.0), 200, seed=0)
+    assert not (diagnose(made.graph).kept & ~made.right).any()

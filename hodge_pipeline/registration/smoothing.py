@@ -19,8 +19,9 @@ from hodge_pipeline.one_blas_thread import one_blas_thread
 from hodge_pipeline.types import Floats
 
 VIDEO_STEP_S = 0.2
-"""Between two frames, at most. Noise of 2 mm put on true paths of hands and of a drone, at 5 to 30 Hz, becomes less on
-each, to half at 30 Hz; at 3 Hz turning to and fro looks like noise.
+"""Between two frames of a video, at most. Of 2 mm of noise put on true paths of hands and of a drone half is left at
+30 Hz, and no more than there was down to 5 Hz; at 3 Hz turning to and fro looks like noise. Tracking agrees: fr1/rpy's
+every third frame, 0.1 s, is tracked well; key frames 0.7 s apart are not.
 """
 FEWEST = 10
 """Frames of a run: fewer hardly tell acceleration from errors."""

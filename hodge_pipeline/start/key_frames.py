@@ -19,6 +19,7 @@ from hodge_pipeline.registration.gaps import told_gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chained
 from hodge_pipeline.registration.readout import estimate_readout, with_readout
 from hodge_pipeline.registration.shutter import at_frame_stamp, velocities
+from hodge_pipeline.registration.smoothing import VIDEO_STEP_S
 from hodge_pipeline.registration.tracked_blocks import BlockRows, TrackedBlocks
 from hodge_pipeline.registration.tracking import FrameBlock, TrackingOptions, frame_blocks, track_block
 from hodge_pipeline.scene import (
@@ -43,8 +44,6 @@ DOUBTED = 0.1
 """Share of the frames whose motion may be an object's, from which the whole path is in doubt: of fr1/rpy's every third
 frame, where nothing moves but much is blurred, 0.07 are.
 """
-VIDEO_STEP_S = 0.2
-"""Between two frames: fr1/rpy's every third frame, 0.1 s, is tracked well; key frames 0.7 s apart are not."""
 
 
 @plain_dataclass(frozen=True)
