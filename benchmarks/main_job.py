@@ -34,7 +34,7 @@ SCRIPT = """
 import sys
 from pathlib import Path
 import hodge_pipeline
-from hodge_pipeline.executors.memory import keep_memory
+from hodge_pipeline.store.memory import keep_memory
 keep_memory()  # as the command does
 from benchmarks.back_and_forth import first_frames
 from hodge_pipeline.recipe.schema import load_recipe

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.refine.pose_graph import read_graph
-from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, linearise
+from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, linearise
+from hodge_pipeline.solvers.backbone.places import Arrangement, Places
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from tests.backbone_graphs import Drive, at_one_place, drive
 from tests.test_backbone import NEVER_WORSE, chain_of
@@ -92,3 +94,24 @@ def test_loops_between_places_at_random_are_used_by_chance_nowhere(data_dir: Pat
 def test_one_loop_of_two_hundred_that_chance_explains_is_not_used() -> None:
     made = at_one_place(drive(seed=0, dimension=3, loops=1, wrong=0.0), 200, seed=0)
     assert not (diagnose(made.graph).kept & ~made.right).any()
+
+
+def test_a_loop_of_a_right_place_that_the_poses_contradict_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever its place says: loops of probability 0 were used."""
+    made = drive(seed=4, wrong=0.1, loops=60)
+    loops = np.flatnonzero(np.diff(made.graph.edges, axis=1)[:, 0] != 1)
+    of, best = Places.of, Places.best
+
+    def with_wrong_loops(start: Linear, *others: Any) -> Places:
+        places = of(start, *others)
+        return replace(places, members=np.where(made.right[start.chain.loop_edge], places.members, 0))
+
+    def without_a_place(places: Places, linear: Linear, enough: float) -> tuple[Arrangement, bool]:
+        found, sure = best(places, linear, enough)
+        return replace(found, right=found.right & (np.arange(len(found.right)) + 1 < len(found.right))), sure
+
+    monkeypatch.setattr(Places, "of", with_wrong_loops)
+    monkeypatch.setattr(Places, "best", without_a_place)
+    backbone = find_backbone(made.graph)
+    assert backbone is not None and backbone.used[loops].any()
+    assert not backbone.used[~made.right].any()

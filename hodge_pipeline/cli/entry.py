@@ -8,7 +8,7 @@ import sys
 def main() -> None:
     """Run the command; stopped before it has begun, it ends with 130 and without a word, as later."""
     try:
-        from hodge_pipeline.executors.memory import keep_memory
+        from hodge_pipeline.store.memory import keep_memory
 
         keep_memory()
         from hodge_pipeline.cli.main import main as command

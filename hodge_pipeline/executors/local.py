@@ -20,8 +20,8 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.errors import WorkerError
-from hodge_pipeline.executors.memory import keep_memory
 from hodge_pipeline.stages import Workers
+from hodge_pipeline.store.memory import keep_memory
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

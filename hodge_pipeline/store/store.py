@@ -22,6 +22,7 @@ from hodge_pipeline.store import artifacts, codec
 from hodge_pipeline.store.codec import CLOUDS
 from hodge_pipeline.store.cost import Cost, Monitor
 from hodge_pipeline.store.log import log
+from hodge_pipeline.store.memory import give_back_memory
 from hodge_pipeline.store.progress import Nobody, Watcher
 from hodge_pipeline.store.workspace import disk_errors
 from hodge_pipeline.types import CloudSet
@@ -76,6 +77,7 @@ class Store:
             log.info("%s: already done", title)
         else:
             self._compute(path, key, title, total, partial(function, *inputs, **resources))
+            self._give_back_memory()
         self.note(*(Note(**note) for note in _unsealed(path / RECORD)["notes"]))
         value: T = codec.load(path, kind)
         self.remember(value, key)
@@ -167,6 +169,13 @@ class Store:
             _seal(part / RECORD, {**facts, "versions": versions(), "cost": vars(cost)})
             _commit(part, path)
         log.info("%s: %.1f s wall, %.1f s CPU, %.0f MB", title, cost.wall_s, cost.cpu_s, cost.peak_mb)
+
+    def _give_back_memory(self) -> None:
+        """Of what a step has read of clouds and has freed, which the next one would be charged with."""
+        for value, _ in self._keys.values():
+            if isinstance(value, CloudSet):
+                value.forget()
+        give_back_memory()
 
     def _listed(self, name: str, function: str, title: str) -> None:
         """Keep the list of the steps so far, in order, without those that another run of this folder left."""

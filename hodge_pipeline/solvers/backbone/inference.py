@@ -98,12 +98,12 @@ def _inferred(
     scales: Scales,
 ) -> Inferred | None:
     """The loops judged, at first at the poses that those which are `used (M,)` lead to."""
-    chain, linear, begun = start.chain, start, 0
+    chain, linear, number = start.chain, start, 0
     broken = int((chain.bridged & (chain.step_edge >= 0)).sum())  # any other step might have been the one
     fold = broken * float(np.log(chain.size))
     enough = MISTAKEN + (scales.surprise() if chain.stated else 0.0) + fold
     for _ in range(REARRANGED):
-        found = _agreed(start, linear, alone, used | always, shares, wrong, always, thin, begun)
+        found = _agreed(start, linear, alone, used | always, shares, wrong, always, thin, number)
         if found is None:
             return None
         agreed, judged, linear, top = found
@@ -111,19 +111,21 @@ def _inferred(
         if not agreed.any() or (judged.factor[agreed] - np.log(agreed.sum())).sum() <= by_chance(int(agreed.sum())):
             break
         places = Places.of(start, alone, agreed, wrong)
-        best, confirmed = places.best(linear, enough, max(scales.step_turn, scales.step_shift))
+        best, confirmed = places.best(linear, enough)
         confirmed = confirmed and places.chance(best.right) + fold < -BY_CHANCE
         used = np.append(best.right, False)[places.members]
         if (used == agreed).all() or not confirmed:
             break
-        linear, begun = best.fit.linear, SETTLING
+        linear, number = best.fit.linear, SETTLING
     used |= always
     reduced = thinned(chain, np.flatnonzero(used))
-    if (agreed & ~used).any():
-        fit = settled(Fit(reduced, start), MOST_STEPS)
-        linear, judged = fit.linear, judge(fit.linear, fit, shares, wrong)
-        top = mixture(judged.log_density)[1] - float(judged.log_density[1].sum())
-    return Inferred(used, judged, scales, start, linear if used.any() else start, reduced, top, confirmed)
+    # wrong loops may have led into a valley that the right ones do not leave
+    fit = min((settled(Fit(reduced, begun), MOST_STEPS) for begun in (linear, start)), key=_cost)
+    judged = judge(fit.linear, fit, shares, wrong)
+    top = mixture(judged.log_density)[1] - float(judged.log_density[1].sum())
+    used &= (judged.log_odds > 0) | always
+    linear, reduced = fit.linear if used.any() else start, thinned(chain, np.flatnonzero(used))
+    return Inferred(used, judged, scales, start, linear, reduced, top, confirmed)
 
 
 REARRANGED = 3
@@ -156,7 +158,7 @@ def _agreed(
         if number == SETTLING and fit.cost > len(reduced.active) * len(chain.axes):
             # more than right loops should leave: the descent may have ended in a valley beside
             other = settled(Fit(reduced, from_rotations(linear, reduced.active)), MOST_STEPS)
-            fit = min(fit, other, key=lambda each: each.cost)
+            fit = min(fit, other, key=_cost)
         linear = fit.linear
         judged = judge(linear, fit, shares, wrong)
         shares, likelihood = mixture(judged.log_density)
@@ -170,6 +172,10 @@ def _agreed(
         seen = np.packbits(used).tobytes()
     judged, linear = best
     return (judged.factor > _limit(judged)) & (judged.log_odds > 0), judged, linear, top
+
+
+def _cost(fit: Fit) -> float:
+    return fit.cost
 
 
 def refused(found: Inferred, always: Bools) -> Inferred:

@@ -32,12 +32,6 @@ a path that closes once would stay open: its loops can say little more than that
 ROUNDS = 6
 MOST_TRIED = 3
 """Places that are left out on trial each time, and groups of unused loops that may be added: limits on cost."""
-STRAINED = 16.0
-"""χ² to a number: errors four times as large as stated. Of right loops of Bicocca and RobotCar it is up to
-12, of wrong ones that bend a ring into themselves 300.
-"""
-MOST_DECOYS = 30
-"""Loops between other places that say what chance reaches: a limit on cost."""
 CLEARLY = float(np.log(20.0))
 """Log-odds that a change must win."""
 LEAST_WON = 0.1
@@ -161,19 +155,15 @@ class Places:
         chain = self.start.chain.with_loops(rows, self.start.chain.ends[rows])
         return self.wrong.log_density(chain, fit.linear.poses)
 
-    def best(self, linear: Linear, enough: float, widened: float) -> tuple[Arrangement, bool]:
+    def best(self, linear: Linear, enough: float) -> tuple[Arrangement, bool]:
         """The likeliest arrangement, from that of all used places on, whose poses are near `linear`, and whether its
         log-odds are `enough`; where they are not, that from the place on which says most by itself.
-
-        `widened`: the factor on stated errors of steps with which the chain has come.
         """
         found = self._improved(self.arranged(self.used, linear))
-        if found.log_odds > enough and found.log_odds > self._by_chance(found, widened):
-            return found, True
-        other = self._improved(self.arranged(self._agreeing_with_strongest(enough), self.start))
-        if other.log_odds > enough and other.log_odds > self._by_chance(other, widened):
-            return other, True
-        return max(found, other, key=lambda each: each.log_odds), False
+        if found.log_odds <= enough:
+            other = self._improved(self.arranged(self._agreeing_with_strongest(enough), self.start))
+            found = max(found, other, key=lambda each: each.log_odds)
+        return found, found.log_odds > enough
 
     def _agreeing_with_strongest(self, enough: float) -> Bools:
         """The place (K,) that says most by itself, and those that agree with it and each other."""
@@ -186,23 +176,6 @@ class Places:
             if (before == right).all():
                 break
         return np.asarray(right)
-
-    def _by_chance(self, found: Arrangement, widened: float) -> float:
-        """Twice the log-odds that as many loops between other places, at random, reach by bending the steps as far: 0
-        where steps hardly err by more than stated.
-        """
-        rows, chain = self.loop[found.right], self.start.chain
-        numbers = found.fit.reduced.active.size * len(chain.axes)
-        if chain.stated and max(widened, 1.0) ** 2 * found.fit.cost < STRAINED * numbers:
-            return 0.0
-        rng = np.random.default_rng(2)
-        some = np.sort(rng.choice(np.flatnonzero(found.right), min(len(rows), MOST_DECOYS), replace=False))
-        of_path = chain.path == chain.path[chain.ends[rows[0], 0]]
-        ends = rng.choice(np.flatnonzero(of_path), (len(some), 2))
-        start = linearise(chain.with_loops(self.loop[some], np.sort(ends, axis=1)), self.start.poses)
-        each, every = np.arange(len(some)), np.ones(len(some), bool)
-        others = Places(start, self.wrong, each, self.bare[some], self.size[some], every, each, self.unused)
-        return 2 * len(rows) / len(some) * others._improved(others.arranged(every, start)).log_odds
 
     def _improved(self, found: Arrangement) -> Arrangement:
         """The arrangement after places that bend it are left out and others added, while the log-odds rise."""

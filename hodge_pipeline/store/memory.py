@@ -1,5 +1,5 @@
-"""How a process that works through many images holds its memory: what was freed is used again, and cycles of objects
-are looked for seldom.
+"""How a process that works through many images holds its memory: what was freed is used again within a stage and given
+back after it, and cycles of objects are looked for seldom.
 """
 
 from __future__ import annotations
@@ -28,3 +28,10 @@ def keep_memory() -> None:
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(_MMAP_THRESHOLD, LARGEST_KEPT)
         mallopt(_TRIM_THRESHOLD, MOST_KEPT)
+
+
+def give_back_memory() -> None:
+    """Give back what was freed, wherever it lies in the heap; nothing where the C library is not glibc."""
+    gc.collect()
+    with suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
