@@ -144,6 +144,20 @@ def test_every_input_and_its_type_is_part_of_the_key(tmp_path: Path, pair: tuple
     assert CALLS == ["any_of"] * 2
 
 
+def read_whole(clouds: CloudSet, *, step: Step) -> float:
+    return float(clouds.points.sum())
+
+
+@pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="nothing says how much of a file is in memory")
+def test_the_memory_of_what_a_step_read_of_clouds_is_given_back(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    made = store.step(made_files, 3, title="a").clouds
+    store.remember(made, "clouds")
+    store.step(read_whole, made, title="b")
+    mappings = Path("/proc/self/smaps").read_text().split("/points.npy", 1)[1]
+    assert "Rss:                   0 kB" in mappings.split("VmFlags", 1)[0]
+
+
 def test_a_file_counts_by_its_contents(tmp_path: Path) -> None:
     file = tmp_path / "input.txt"
     for text in ("one", "two", "two"):
