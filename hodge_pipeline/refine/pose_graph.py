@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from hodge_pipeline import registry
+from hodge_pipeline.complex.conventions import inverted_notes
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.errors import GraphError, SourceError
@@ -116,7 +117,10 @@ class SolvedFile:
 
 
 def read_graph(path: Path) -> Source:
-    """The graph at a path: of any registered format, or of a run folder. Raises `SourceError` where there is none."""
+    """The graph at a path: of any registered format, or of a run folder; a note says if its motions look inverted.
+
+    Raises `SourceError` where there is none.
+    """
     path = path / RUN_GRAPH if (path / RUN_GRAPH).is_file() else path
     reader = guess_reader(path)
     source = reader.open(path)
@@ -125,7 +129,7 @@ def read_graph(path: Path) -> Source:
         run = command("hodge", "run", recipe, "--source", path, "--out", "RUN")
         rest = f"; its frames give one: {run}, then give RUN" if source.frames else f" but {without_frames(source)}"
         raise SourceError(f"{path}: holds no graph of measured edges{rest}")
-    return source
+    return replace(source, notes=(*inverted_notes(source.graph), *source.notes))
 
 
 def disabled_edges(graph: ViewGraph, pairs: Sequence[str]) -> Bools:

@@ -308,8 +308,10 @@ def settled(fit: Fit, steps: int, least_won: float = LEAST_WON) -> Fit:
     return fit
 
 
-def from_rotations(linear: Linear, rows: Ints) -> Linear:
-    """The chain at poses that begin at its chordal rotations with these loops, which need no start."""
+def from_rotations(linear: Linear, rows: Ints, steps: int) -> Linear:
+    """The chain at poses that begin at its chordal rotations with these loops, which need no start, after as many
+    steps: loops that contradict each other may take hundreds.
+    """
     chain, at = linear.chain, np.flatnonzero(linear.chain.inner)
     edges = np.concatenate([np.stack([at - 1, at], axis=1), chain.ends[rows]])
     information = np.zeros((len(edges), 6, 6))
@@ -317,7 +319,7 @@ def from_rotations(linear: Linear, rows: Ints) -> Linear:
     information[:, chain.axes[:, None], chain.axes] = of_axes
     motion = np.concatenate([chain.step[at], chain.motion[rows]])
     graph = ViewGraph.from_edges(np.arange(chain.size), edges, motion, information)
-    found = solve(graph, start=linear.poses, objective="isotropic", dimension=2 if len(chain.axes) == 3 else 3)
+    found = solve(graph, start=linear.poses, dimension=2 if len(chain.axes) == 3 else 3, max_iterations=steps)
     return linearise(chain, found.world_from_cam)
 
 
