@@ -74,12 +74,13 @@ def solve_robust(
 
 
 def _on_backbone(graph: ViewGraph, backbone: Backbone, solved: Solver) -> Solution:
-    """The poses of a backbone and the loops that it confirms, with the information as it is stated where it explains
-    what these leave over, else with the errors that they were found to have; `confirmed` is None where no loop is.
+    """The poses of a backbone and the loops that it confirms, with the information where it states something of every
+    axis and explains what these leave over, else with the errors that they were found to have; `confirmed` is None
+    where no loop is.
     """
     chosen = graph.select(np.flatnonzero(backbone.used))
-    final = solved(chosen, backbone.world_from_cam)
-    if not is_explained(chosen, final):
+    final = solved(chosen, backbone.world_from_cam) if backbone.chain.stated else None
+    if final is None or not is_explained(chosen, final):
         final = solved(backbone.weighted(graph), backbone.world_from_cam)
     return replace(
         final,

@@ -31,7 +31,7 @@ class Chain:
     - `loop_edge (M,)`; `ends (M, 2)`, the first the lower position; `motion (M, 4, 4)`; `covariance (M, p, p)`.
     - `bridged (n,)`: steps with a guess in place of what the graph says; no scale is learned for its covariance.
     - `axes (p,)`: of a twist those that are free, three in the plane; `stated`: whether the graph's information is more
-      than the identity that stands for unknown.
+      than the identity that stands for unknown, and most steps state something of each axis.
     """
 
     order: Ints
@@ -149,10 +149,11 @@ def linear_forest(edges: Ints, count: int, trusted: Bools) -> Bools:
 
 def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
     """The chain of the backbone's edges (E,), which make paths; edges from a vertex to itself are left out."""
+    graph, told = believed(graph, backbone)
     order, step_edge, path = _walk(graph.edges, graph.vertex_count, np.flatnonzero(backbone))
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
-    axes = PLANAR_AXES if graph.dimension == 2 else np.arange(6)
+    axes = free_axes(graph)
     covariance = se3.covariances(graph.information[:, axes[:, None], axes])
     rows = np.flatnonzero(~backbone & (graph.edges[:, 0] != graph.edges[:, 1]))
     low, high = np.sort(place[graph.edges[rows]], axis=1).T
@@ -179,7 +180,7 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
         loop_covariance,
         np.zeros(len(order), bool),
         axes,
-        not has_unit_information(graph),
+        told and not has_unit_information(graph),
     )
 
 
@@ -187,6 +188,47 @@ EXACT = 0.03
 """Of the usual standard deviation: none is believed to be much smaller. Beside one of a thousandth the normal
 equations lose what the other edges say; from .01 to .1 the manhattan graph is judged alike.
 """
+
+
+MOST_OF_A_STEP = 0.2
+"""An odometry's error where it states no larger one, root mean squares. On 71 simulated graphs where nothing is stated
+75 wrong loops were kept without it and 19 with it, 13 and 12 right ones lost.
+"""
+NOTHING_RAD, NOTHING_TIMES = 1.0, 100.0
+"""Standard deviations of steps, in radians and in those of the axis that is known best, from which on they state
+nothing: robots on a floor fill the covariance of their odometry with 1e6 for what they assume and 1e3 for what they do
+not know.
+"""
+
+
+def believed(graph: ViewGraph, steps: Bools) -> tuple[ViewGraph, bool]:
+    """The graph with what is believed of its steps (E,), and whether that is what they state: an axis of which most of
+    them state nothing errs as the others of its kind do, or by `MOST_OF_A_STEP` where nothing is stated of any. Of
+    unknown information, the identity, nothing is changed.
+    """
+    rows, axes = np.flatnonzero(steps), free_axes(graph)
+    if has_unit_information(graph) or not len(rows):
+        return graph, True
+    covariance = se3.covariances(graph.information[rows[:, None, None], axes[:, None], axes])
+    moved, spread = se3.log(graph.i_from_j[rows])[:, axes], np.sqrt(np.einsum("sii->si", covariance))
+    usual, factor = np.median(spread, axis=0), np.ones_like(spread)
+    for part, least in ((np.flatnonzero(axes < 3), NOTHING_RAD), (np.flatnonzero(axes >= 3), 0.0)):
+        step = float(np.sqrt(np.mean(moved[:, part] ** 2)))
+        told = usual[part] <= (least or max(step, NOTHING_TIMES * usual[part].min()))
+        if not told.all() and step > 0:
+            mean = np.sqrt(np.mean(spread[:, part[told]] ** 2, axis=1)) if told.any() else MOST_OF_A_STEP * step
+            factor[:, part[~told]] = (mean / spread[:, part[~told]].T).T
+    if (factor == 1).all():
+        return graph, True
+    information = graph.information.copy()
+    inverse = np.linalg.inv(factor[:, :, None] * covariance * factor[:, None, :])
+    information[rows[:, None, None], axes[:, None], axes] = inverse
+    return replace(graph, information=information), False
+
+
+def free_axes(graph: ViewGraph) -> Ints:
+    """Of a twist (6,) the axes in which the graph's frames move."""
+    return PLANAR_AXES if graph.dimension == 2 else np.arange(6)
 
 
 def linked(chain: Chain, low: int, high: int, motion: Floats, covariance: Floats) -> Chain:

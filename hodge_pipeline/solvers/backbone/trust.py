@@ -10,6 +10,7 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone.bridged import MOST_BREAKS, infer_bridged
 from hodge_pipeline.solvers.backbone.chain import (
     Chain,
+    believed,
     linear_forest,
     make_chain,
     one_of_each_place,
@@ -59,6 +60,7 @@ class Backbone:
 
     def weighted(self, graph: ViewGraph) -> ViewGraph:
         """The graph of the edges that count, with the information that their errors were found to have."""
+        graph, _ = believed(graph, self.steps)
         step, loop = self.found.scales.units(self.chain)
         width = np.ones((graph.edge_count, len(self.chain.axes)))
         width[self.chain.step_edge[self.chain.step_edge >= 0]] = step * LOCAL
@@ -85,7 +87,8 @@ class Backbone:
             return f"{trusted}, {counted(loops, 'loop')} that nothing confirms: the poses are the backbone's"
         broken = int((self.steps & ~self.used).sum())
         said = f", {broken} of them called wrong by the loops over it" if broken else ""
-        return f"{trusted}{said}, {used} of {loops} loops confirmed"
+        errors = "" if self.chain.stated else "; errors as loops show them, since the information lacks some"
+        return f"{trusted}{said}, {used} of {loops} loops confirmed{errors}"
 
 
 def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) -> Backbone | None:

@@ -1,0 +1,68 @@
+"""Covariances that robots fill with constants for what they do not know: the loops tell how steps err."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.robust import solve_robust
+from hodge_pipeline.solvers.backbone.chain import believed, sequential_edges
+from hodge_pipeline.types import Floats, ViewGraph
+from tests.backbone_graphs import drive
+from tests.test_backbone import NEVER_WORSE
+
+OF_ROBOTS = np.diag([1e-6, 1e-6, 1e-3, 1e3, 1e3, 1e-6])
+"""The information of a wheeled base's odometry in many ROS drivers: 1e6 for height, roll and pitch, 1e3 for heading."""
+
+
+def stating(graph: ViewGraph, information: Floats) -> ViewGraph:
+    """The graph whose steps state this (6, 6)."""
+    out = graph.information.copy()
+    axes = np.array([2, 3, 4]) if graph.dimension == 2 else np.arange(6)
+    out[np.ix_(np.flatnonzero(sequential_edges(graph)), axes, axes)] = information[np.ix_(axes, axes)]
+    return replace(graph, information=out)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(("world", "seed"), [("ring", 0), ("town", 2), ("corridor", 1), ("room", 0)])
+@pytest.mark.parametrize("wrong", [0.0, 0.5])
+def test_steps_that_state_nothing_of_some_axes(dimension: int, world: str, seed: int, wrong: float) -> None:
+    """All right loops were lost, or poses up to 90 m off where odometry has 0.6; the robust solve was worse yet."""
+    made = drive(seed=seed, dimension=dimension, world=world, wrong=wrong, loops=60)
+    graph, odometry_m = stating(made.graph, OF_ROBOTS), made.error_m(made.odometry())
+    found, as_stated = diagnose(graph), diagnose(made.graph)
+    assert not (found.kept & ~made.right).any()
+    assert (found.kept & made.right).sum() >= 0.9 * made.right.sum()
+    assert "as loops show them" in " ".join(found.notes)
+    for poses in (found.world_from_cam, solve_robust(graph).world_from_cam):
+        assert made.error_m(poses) < max(1.5 * made.error_m(as_stated.world_from_cam), 0.6 * odometry_m)
+        assert made.error_m(poses) <= NEVER_WORSE * odometry_m
+
+
+def test_what_is_believed_of_steps() -> None:
+    graph = drive(dimension=3, wrong=0.0, loops=10).graph
+    steps = sequential_edges(graph)
+    for stated in (graph, replace(graph, information=np.tile(np.eye(6), (graph.edge_count, 1, 1)))):
+        same, as_stated = believed(stated, steps)
+        assert same is stated and as_stated
+    changed, as_stated = believed(stating(graph, OF_ROBOTS), steps)
+    assert not as_stated
+    np.testing.assert_array_equal(changed.information[~steps], graph.information[~steps])
+    errors = np.sqrt(np.diag(np.linalg.inv(changed.information[steps][0])))
+    np.testing.assert_allclose(errors[3:], np.sqrt(1e-3), rtol=1e-6)
+    assert (errors[:3] < 0.1).all() and np.ptp(errors[:3]) < 1e-9
+    nothing, as_stated = believed(graph, np.zeros_like(steps))
+    assert nothing is graph and as_stated
+
+
+def test_a_direction_that_few_steps_do_not_measure_is_as_stated() -> None:
+    """A robot that slides along a bare corridor for a while says so, and that is believed."""
+    graph = drive(dimension=3, wrong=0.0, loops=10).graph
+    information = graph.information.copy()
+    sliding = np.flatnonzero(sequential_edges(graph))[100:150]
+    information[sliding, 3, 3] = 1e-3
+    stated = replace(graph, information=information)
+    assert believed(stated, sequential_edges(graph))[0] is stated
