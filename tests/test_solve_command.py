@@ -14,7 +14,7 @@ from hodge_adapters.pose_graphs.g2o import load_g2o, write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import CheckError, GraphError, HodgeError, RecipeError, SourceError
-from hodge_pipeline.refine.pose_graph import Choices, disabled_edges, solve_file
+from hodge_pipeline.refine.pose_graph import UNTOLD, Choices, disabled_edges, solve_file
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.types import ViewGraph
 from tests.backbone_graphs import drive
@@ -215,3 +215,13 @@ def test_where_no_edge_says_anything_nothing_is_called_solved(tmp_path, ring, ho
     text = hodge(tmp_path / "in.g2o", *how, "--out", tmp_path / "out.g2o")
     assert text.startswith("verdict  Nothing to solve: no edge joins two vertices")
     np.testing.assert_array_equal(load_g2o(tmp_path / "out.g2o").trajectory.world_from_cam[:, 0, 3], [0, 1, 2])
+
+
+def test_an_odometry_that_states_nothing_of_some_axes_is_told(tmp_path: Path) -> None:
+    step = "EDGE_SE2 {} {} 1 0 0.01 1000 0 0 1000 0 0.001"
+    lines = [step.format(k, k + 1) for k in range(9)] + ["EDGE_SE2 0 9 9 0.1 0 1000 0 0 1000 0 1000"]
+    (tmp_path / "robot.g2o").write_text("\n".join(lines))
+    assert UNTOLD in solve_file(tmp_path / "robot.g2o", Choices()).solution.notes
+    assert UNTOLD not in solve_file(tmp_path / "robot.g2o", Choices(robust=True)).solution.notes
+    (tmp_path / "robot.g2o").write_text("\n".join(lines).replace("0.001", "1000"))
+    assert UNTOLD not in solve_file(tmp_path / "robot.g2o", Choices()).solution.notes

@@ -18,6 +18,7 @@ from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.errors import GraphError, SourceError
 from hodge_pipeline.pairs.edits import joining
 from hodge_pipeline.recipe.recipe_file import recipe_names
+from hodge_pipeline.solvers.backbone.chain import believed, sequential_edges
 from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.setup import InitialName
@@ -161,6 +162,8 @@ def solve_file(path: Path, choices: Choices) -> SolvedFile:
         graph = replace(graph, information=graph.information * np.outer(SESYNC_UNITS, SESYNC_UNITS))
     cpu_s, wall_s = time.process_time(), time.monotonic()
     solution = _solved(graph, start, choices)
+    if not choices.robust and not believed(graph, sequential_edges(graph))[1]:
+        solution = replace(solution, notes=(UNTOLD, *solution.notes))
     cpu_s, wall_s = time.process_time() - cpu_s, time.monotonic() - wall_s
     weights = np.zeros(len(off))
     weights[~off] = solution.weights
@@ -168,6 +171,9 @@ def solve_file(path: Path, choices: Choices) -> SolvedFile:
         (f"{counted(int(off.sum()), 'edge is|edges are')} disabled", *solution.notes) if off.any() else solution.notes
     )
     return SolvedFile(source, source.graph, replace(solution, weights=weights, notes=notes), choices, cpu_s, wall_s)
+
+
+UNTOLD = "the odometry states no errors of some axes: --robust learns them from the loops, which may be far better"
 
 
 def _solved(graph: ViewGraph, start: Floats | None, choices: Choices) -> Solution:
