@@ -268,3 +268,31 @@ def test_binary_junk_is_no_text(tmp_path):
     assert G2oReader().sniff(tmp_path / "junk.g2o").confidence < 0.5
     with pytest.raises(SourceError, match="cannot be read as text"):
         load_g2o(tmp_path / "junk.g2o")
+
+
+@pytest.mark.parametrize(
+    ("tag", "motion", "information"),
+    [
+        ("EDGE_SE3:QUAT", "1 2 3 0 0 0 1", np.eye(6)),
+        ("EDGE_SE2", "1 2 0.5", np.diag([0, 0, 1, 1, 1, 0])),
+    ],
+)
+def test_edges_without_information_state_nothing(tmp_path: Path, tag: str, motion: str, information) -> None:
+    """As LIO-SAM's descendants save a session."""
+    source = load_g2o(write(tmp_path / "a.g2o", f"{tag} 0 1 {motion}", f"{tag} 1 2 {motion}"))
+    np.testing.assert_array_equal(source.graph.information, np.tile(information, (2, 1, 1)))
+    np.testing.assert_array_equal(source.graph.i_from_j[0][:2, 3], [1, 2])
+    assert "2 edges state no information: taken as unknown" in source.notes
+    with pytest.raises(SourceError, match=":2: .* needs"):
+        load_g2o(write(tmp_path / "b.g2o", f"{tag} 0 1 {motion}", f"{tag} 1 2 {motion} 1"))
+
+
+def test_positions_that_are_known_in_space(tmp_path):
+    """As hdl_graph_slam writes of GPS: without an angle, and without a height where it is not known."""
+    lines = [EDGE, "EDGE_SE3_PRIORXYZ 7 1 2 3 10 1 0 20 0 30", "EDGE_SE3_PRIORXY 3 4 5 40 0 50"]
+    priors = load_g2o(write(tmp_path / "a.g2o", *lines)).graph.priors
+    np.testing.assert_array_equal(priors.vertices, [0, 1])
+    np.testing.assert_array_equal(priors.world_from_vertex[:, :3, 3], [[1, 2, 3], [4, 5, 0]])
+    np.testing.assert_array_equal(priors.information[:, :3], 0)
+    np.testing.assert_array_equal(priors.information[0, 3:, 3:], [[10, 1, 0], [1, 20, 0], [0, 0, 30]])
+    np.testing.assert_array_equal(priors.information[1, 3:, 3:], np.diag([40, 50, 0]))

@@ -59,7 +59,7 @@ def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbo
     if backbone is not None and not backbone.doubted:
         return backbone
     found = _by_cycles(graph, options)
-    if options.trust != AUTO:
+    if options.trust != AUTO or not graph.edge_count:
         return found
     backbone, explains_more = backbone_anyway(graph, found.kept, backbone)
     if backbone is None or explains_more:

@@ -93,28 +93,42 @@ class Half:
 
 def _spatial(records: dict[str, Records]) -> Half:
     vertices, edges = records["VERTEX_SE3:QUAT"], records["EDGE_SE3:QUAT"]
-    information = information_of_file(upper_triangle(edges.values[:, 7:], 6))
+    information = _triangles(edges, 6)
+    information = information_of_file(information) if _states(edges) else information
     poses, motions = spatial_poses(vertices), spatial_poses(edges)
     plain, levered = records[g2o_priors.SPATIAL], records[g2o_priors.SPATIAL_OFFSET]
     parameters = records[g2o_priors.OFFSET]
     offsets = g2o_priors.offsets_of(levered, parameters, spatial_poses(parameters))
     known = [information_of_file(upper_triangle(prior.values[:, 7:], 6)) for prior in (plain, levered)]
     moved, moved_information = g2o_priors.moved_to_body(spatial_poses(levered), known[1], offsets)
+    on_position = [records[tag] for tag in (g2o_priors.SPATIAL_XYZ, g2o_priors.SPATIAL_XY)]
+    places, of_places = zip(*map(g2o_priors.positions, on_position), strict=True)
     return Half(
         vertices.keys[:, 0],
         poses,
         edges.keys,
         motions,
         information,
-        np.concatenate([plain.keys[:, 0], levered.keys[:, 0]]),
-        np.concatenate([spatial_poses(plain), moved]),
-        np.concatenate([known[0], moved_information]),
+        np.concatenate([prior.keys[:, 0] for prior in (plain, levered, *on_position)]),
+        np.concatenate([spatial_poses(plain), moved, *places]),
+        np.concatenate([known[0], moved_information, *of_places]),
     )
+
+
+def _triangles(edges: Records, size: int) -> Floats:
+    """The information (E, size, size) of edges; the identity, which stands for unknown, where they state none."""
+    triangles = edges.values[:, -size * (size + 1) // 2 :] if _states(edges) else np.eye(size)[np.triu_indices(size)]
+    return upper_triangle(np.broadcast_to(triangles, (len(edges), size * (size + 1) // 2)), size)
+
+
+def _states(edges: Records) -> bool:
+    """Whether the information follows the motion."""
+    return edges.values.shape[1] in (SPATIAL_EDGE[0], PLANAR_EDGE[0])
 
 
 def _planar(records: dict[str, Records]) -> Half:
     vertices, edges = records["VERTEX_SE2"], records["EDGE_SE2"]
-    information = lift_information(upper_triangle(edges.values[:, 3:], 3))
+    information = lift_information(_triangles(edges, 3))
     poses, motions = lift_poses(vertices.values), lift_poses(edges.values[:, :3])
     whole, position = records[g2o_priors.PLANAR], records[g2o_priors.PLANAR_POSITION]
     anywhere = np.pad(position.values[:, :2], ((0, 0), (0, 1)))
@@ -193,13 +207,18 @@ def refuse_landmarks_alone(path: Path, other: dict[str, int]) -> None:
 
 
 KEYS = {"VERTEX_SE3:QUAT": 1, "EDGE_SE3:QUAT": 2, "VERTEX_SE2": 1, "EDGE_SE2": 2, "FIX": 1, **g2o_priors.KEYS}
-SPATIAL_TAGS = ("VERTEX_SE3:QUAT", g2o_priors.SPATIAL, g2o_priors.SPATIAL_OFFSET, g2o_priors.OFFSET)
+SPATIAL_TAGS = (
+    *("VERTEX_SE3:QUAT", g2o_priors.SPATIAL, g2o_priors.SPATIAL_OFFSET, g2o_priors.OFFSET),
+    *(g2o_priors.SPATIAL_XYZ, g2o_priors.SPATIAL_XY),
+)
 PLANAR_TAGS = ("VERTEX_SE2", g2o_priors.PLANAR, g2o_priors.PLANAR_POSITION)
+SPATIAL_EDGE, PLANAR_EDGE = (28, 7), (9, 3)
+"""Numbers of an edge with its information, and without, as LIO-SAM's descendants write it."""
 COLUMNS = {
     "VERTEX_SE3:QUAT": (7,),
-    "EDGE_SE3:QUAT": (28,),
+    "EDGE_SE3:QUAT": SPATIAL_EDGE,
     "VERTEX_SE2": (3,),
-    "EDGE_SE2": (9,),
+    "EDGE_SE2": PLANAR_EDGE,
     "FIX": None,
     **g2o_priors.COLUMNS,
 }
@@ -225,6 +244,9 @@ def load_g2o(path: Path | str) -> Source:
     notes = skipped({**other, **strange})
     for tag, what in (("VERTEX_SE3:QUAT", "vertices"), ("EDGE_SE3:QUAT", "edges")):
         notes += length_notes(records[tag].values[:, 3:7], what)
+    edges = records["EDGE_SE2" if dimension == 2 else "EDGE_SE3:QUAT"]
+    if len(edges) and not _states(edges):
+        notes.append(f"{counted(len(edges), 'edge states|edges state')} no information: taken as unknown")
     fixed_keys = records["FIX"].keys.reshape(-1)
     absent = np.setdiff1d(fixed_keys, np.concatenate([half.vertex_keys, half.edge_keys.reshape(-1)]))
     if len(absent):

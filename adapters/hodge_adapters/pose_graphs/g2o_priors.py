@@ -12,10 +12,34 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Ints, Priors
 
 SPATIAL, SPATIAL_OFFSET, OFFSET = "EDGE_PRIOR_SE3", "EDGE_SE3_PRIOR", "PARAMS_SE3OFFSET"
+SPATIAL_XYZ, SPATIAL_XY = "EDGE_SE3_PRIORXYZ", "EDGE_SE3_PRIORXY"
 PLANAR, PLANAR_POSITION = "EDGE_PRIOR_SE2", "EDGE_PRIOR_SE2_XY"
-KEYS = {SPATIAL: 1, SPATIAL_OFFSET: 2, OFFSET: 1, PLANAR: 1, PLANAR_POSITION: 1}
-COLUMNS = {SPATIAL: (28,), SPATIAL_OFFSET: (28,), OFFSET: (7,), PLANAR: (9,), PLANAR_POSITION: (5,)}
-"""`EDGE_SE3_PRIOR` names the sensor's offset on the body after the vertex; the others hold for the body itself."""
+KEYS = {SPATIAL: 1, SPATIAL_OFFSET: 2, OFFSET: 1, SPATIAL_XYZ: 1, SPATIAL_XY: 1, PLANAR: 1, PLANAR_POSITION: 1}
+COLUMNS = {
+    SPATIAL: (28,),
+    SPATIAL_OFFSET: (28,),
+    OFFSET: (7,),
+    SPATIAL_XYZ: (9,),
+    SPATIAL_XY: (5,),
+    PLANAR: (9,),
+    PLANAR_POSITION: (5,),
+}
+"""`EDGE_SE3_PRIOR` names the sensor's offset on the body after the vertex; the others hold for the body itself.
+Positions alone, in space, are what hdl_graph_slam writes of GPS.
+"""
+
+
+def positions(records: Records) -> tuple[Floats, Floats]:
+    """Poses (P, 4, 4) at known positions in space, and the information (P, 6, 6): none of rotations and of a height
+    that is not given.
+    """
+    size = 3 if records.values.shape[1] == 9 else 2
+    at, information = np.zeros((len(records), 3)), np.zeros((len(records), 6, 6))
+    at[:, :size] = records.values[:, :size]
+    rows, columns = np.triu_indices(size)
+    told = records.values[:, size:]
+    information[:, 3 + rows, 3 + columns] = information[:, 3 + columns, 3 + rows] = told
+    return se3.from_parts(np.broadcast_to(np.eye(3), (len(at), 3, 3)), at), information
 
 
 def offsets_of(priors: Records, parameters: Records, offsets: Floats) -> Floats:
