@@ -227,3 +227,24 @@ def _wrong(rng: np.random.Generator, truth: Floats, count: int, group: int, dime
             edges.append((i + k, j + k))
             motion.append(se3.inverse(truth[i + k]) @ world_from_world @ truth[j + k])
     return np.array(edges[:count], np.int64).reshape(-1, 2), np.array(motion[:count]).reshape(-1, 4, 4)
+
+
+def two_laps(seed: int, *, wrong: float = 0.2, bias: float = 0.001, lap: int = 300) -> Drive:
+    """Two laps of a circle in space by an odometry that turns too far by the same at each step, loops of the second
+    lap over the first, some wrong, and the information that hdl_graph_slam states: errors of 5 m and .2 rad.
+    """
+    rng, count, radius = np.random.default_rng(seed), 2 * lap, 3 * lap / (2 * np.pi)
+    angle = 2 * np.pi * np.arange(count) / lap
+    truth = se3.exp(np.outer(angle, [0, 0, 1, 0, 0, 0]))
+    truth[:, :3, 3] = np.column_stack([radius * np.sin(angle), -radius * np.cos(angle), np.zeros(count)])
+    steps = [(k, k + 1) for k in range(count - 1)]
+    edges = np.array(steps + [(k, k + lap + int(rng.integers(-2, 3))) for k in range(5, lap - 5, 5)])
+    twist = rng.normal(size=(len(edges), 6)) * np.repeat([0.002, 0.05], 3)
+    twist[: len(steps), :3] += bias * rng.normal(size=3)
+    motions = se3.inverse(truth[edges[:, 0]]) @ truth[edges[:, 1]] @ se3.exp(twist)
+    right = np.concatenate([np.ones(len(steps), bool), rng.random(len(edges) - len(steps)) >= wrong])
+    for row in np.flatnonzero(~right):
+        off = np.concatenate([rng.normal(0, 0.3, 3), rng.normal(0, 20, 3)])
+        motions[row] = motions[row] @ se3.exp(off[None])[0]
+    information = np.tile(np.diag(np.repeat([25.0, 0.04], 3)), (len(edges), 1, 1))
+    return Drive(ViewGraph.from_edges(np.arange(count), edges, motions, information), truth, right)

@@ -21,7 +21,7 @@ from hodge_pipeline.solvers.backbone.judge import left_out
 from hodge_pipeline.solvers.backbone.sparse import Network
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.solvers.maximum_likelihood import solve
-from hodge_pipeline.types import ViewGraph
+from hodge_pipeline.types import Priors, ViewGraph
 from tests.backbone_graphs import Drive, drive, round_trip
 
 NEVER_WORSE = 1.02
@@ -391,3 +391,18 @@ def test_more_loops_than_can_be_inverted_are_judged_at_the_poses_of_some(monkeyp
     assert not (found.used & ~made.right).any()
     assert found.used[made.right].mean() > 0.95
     assert made.error_m(found.world_from_cam) < made.error_m(made.odometry())
+
+
+def test_priors_of_vertices_do_not_hinder_the_backbone() -> None:
+    """As of GPS: the loops were judged without a backbone, and all of 62 left out of a graph of hdl_graph_slam."""
+    made = drive(dimension=3, world="town", seed=2, wrong=0.5, loops=60)
+    at = np.arange(0, made.graph.vertex_count, 20)
+    known = np.tile(np.diag([0, 0, 0, 100.0, 100, 100]), (len(at), 1, 1))
+    priors = Priors(at, se3.from_parts(np.broadcast_to(np.eye(3), (len(at), 3, 3)), made.truth[at, :3, 3]), known)
+    graph = replace(made.graph, priors=priors)
+    found = diagnose(graph)
+    np.testing.assert_array_equal(found.kept, made.right)
+    solved = solve_robust(graph)
+    np.testing.assert_array_equal(solved.weights > 0, made.right)
+    off = np.linalg.norm(solved.world_from_cam[:, :3, 3] - made.truth[:, :3, 3], axis=1)
+    assert off.max() < 0.5  # in the world of the priors, without a fit

@@ -15,7 +15,7 @@ from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, linearise
 from hodge_pipeline.solvers.backbone.places import Arrangement, Places
 from hodge_pipeline.solvers.backbone.trust import find_backbone
-from tests.backbone_graphs import Drive, at_one_place, drive
+from tests.backbone_graphs import Drive, at_one_place, drive, two_laps
 from tests.test_backbone import NEVER_WORSE, chain_of
 from tests.test_solver_robust import rings, spoiled
 
@@ -61,6 +61,17 @@ def test_closing_errors_have_the_covariance_of_their_paths_and_loops(dimension: 
     rows = np.sort(np.array([first, *apart[:1]]))
     expected = np.linalg.slogdet(linear.path(*chain.ends[rows].T) + linear.loops[1][rows])[1].sum()
     assert Fit(Reduced.of(chain, rows), linear).log_det == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", [1, 4, 7])
+def test_a_second_lap_over_the_first_says_more_than_one_mistaken_corridor(seed: int) -> None:
+    """Each loop alone says next to nothing where odometry is off by as much as the lap is wide; with all of the lap one
+    testimony none of 45 right loops was used, of seed 7.
+    """
+    made = two_laps(seed)
+    found = diagnose(made.graph)
+    assert (found.kept & ~made.right).sum() <= 1 and (found.kept & made.right).sum() >= made.right.sum() - 3
+    assert made.error_m(found.world_from_cam) < 1.0 < 30 < made.error_m(made.odometry())
 
 
 LATTICES = {"triangles": (1, 30, 31), "squares": (1, 30), "squares, wide": (1, 50)}

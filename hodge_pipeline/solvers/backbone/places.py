@@ -38,6 +38,8 @@ LEAST_WON = 0.1
 """Of χ², for which poses are improved where places are compared."""
 ADJACENT = 2.0
 """Places between places that follow each other: a corridor that is mistaken for another is one testimony."""
+LONGEST = 5.0
+"""Places of a mistaken corridor, of 20 steps or more each."""
 FEW_UNUSED = 0.1
 """Of the loops: with fewer, mistaken corridors are not reckoned with, and each place counts. Looked at on a walk all of
 whose loops are right, and on graphs of which four fifths or half are wrong, not between.
@@ -88,7 +90,7 @@ class Places:
         run = np.arange(len(place))
         if len(used) - len(rows) > FEW_UNUSED * len(used):
             adjacent = cKDTree(ends[place]).query_pairs(ADJACENT, p=np.inf, output_type="ndarray")
-            run = connected_components(adjacent, len(place))
+            run = _cut(connected_components(adjacent, len(place)), ends[place])
         by_size = np.lexsort((-loops, run))
         first = by_size[np.unique(run[by_size], return_index=True)[1]]
         groups = agreeing_groups(start, alone, np.flatnonzero(distance > 1.0))
@@ -202,6 +204,18 @@ class Places:
             bent = np.argsort(-chi2, kind="stable")
             out = [found.right & (each != place) for place in active[bent[worth[bent] < 0][:MOST_TRIED]]]
         return out + [found.right | (each == place) for place in np.flatnonzero(~self.used & ~found.right)]
+
+
+def _cut(run: Ints, ends: Floats) -> Ints:
+    """The runs (K,) of places, of which loops have these ends (K, 2), cut into parts of up to `LONGEST`."""
+    part, after = np.empty_like(run), 0
+    for number in range(run.max(initial=-1) + 1):
+        rows = np.flatnonzero(run == number)
+        along = ends[rows, np.ptp(ends[rows], axis=0).argmax()]
+        at = ((along - along.min()) / LONGEST).astype(np.int64)
+        part[rows] = after + np.unique(at, return_inverse=True)[1]
+        after = int(part[rows].max()) + 1
+    return part
 
 
 def _log_student(chi2: Floats | float, count: int) -> Floats:

@@ -101,7 +101,7 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
     if trust == NONE or not graph.edge_count:
         return None
     chosen = sequential_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
-    if trust == AUTO and (graph.priors is not None or chosen.sum() < max(FEWEST_STEPS, COVERED * graph.vertex_count)):
+    if trust == AUTO and chosen.sum() < max(FEWEST_STEPS, COVERED * graph.vertex_count):
         return None
     if not chosen.any():
         raise GraphError("no edge joins consecutive vertices, so that there is no sequence to trust: use --trust none")
