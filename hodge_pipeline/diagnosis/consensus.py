@@ -42,8 +42,9 @@ def find_consensus(evidence: Evidence, start: Floats | None = None) -> tuple[Fit
     else:
         best = _mended(evidence, grown)
         if start is not None:
-            other = Alignment(np.zeros(len(start), np.int64), start)
-            best = min(best, fit(evidence, fit(evidence, other, ANNEALED), (GATE,)), key=_misfit)
+            other = fit(evidence, Alignment(np.zeros(len(start), np.int64), start), ANNEALED)
+            # by how many agree: groups of wrong loops may leave less where they have torn a graph
+            best = max(best, fit(evidence, other, (GATE,)), key=_agreement)
     best = _one_of_each_series(best, evidence)
     agreeing = np.sqrt(np.maximum(0.0, 1 - best.chi2 / GATE))
     return best, _with_prior(agreeing, evidence.prior)
@@ -100,6 +101,10 @@ def _in_order(evidence: Evidence) -> Alignment:
 def _misfit(found: Fit) -> float:
     """χ² of all edges, of each no more than the gate."""
     return float(np.minimum(found.chi2, GATE).sum())
+
+
+def _agreement(found: Fit) -> int:
+    return int(found.used.sum())
 
 
 def _with_prior(agreeing: Floats, prior: Floats) -> Floats:
