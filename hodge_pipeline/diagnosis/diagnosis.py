@@ -64,6 +64,8 @@ def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbo
     backbone, explains_more = backbone_anyway(graph, found.kept, backbone)
     if backbone is None or explains_more:
         return backbone or found
+    if not backbone.found.confirmed:
+        return found
     # groups of wrong loops may have torn what its poses hold together
     return _by_cycles(graph, options, backbone.world_from_cam)
 
