@@ -32,6 +32,5 @@ def keep_memory() -> None:
 
 def give_back_memory() -> None:
     """Give back what was freed, wherever it lies in the heap; nothing where the C library is not glibc."""
-    gc.collect()
     with suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
