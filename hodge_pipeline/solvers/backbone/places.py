@@ -39,7 +39,9 @@ LEAST_WON = 0.1
 ADJACENT = 2.0
 """Places between places that follow each other: a corridor that is mistaken for another is one testimony."""
 LONGEST = 5.0
-"""Places of a mistaken corridor, of 20 steps or more each."""
+"""Places of a mistaken corridor, of 20 steps or more each: a longer run is as many testimonies as it has such parts.
+Without a limit none of 52 loops of a second lap counted, each of which says nothing alone beside 160 m of drift.
+"""
 FEW_UNUSED = 0.1
 """Of the loops: with fewer, mistaken corridors are not reckoned with, and each place counts. Looked at on a walk all of
 whose loops are right, and on graphs of which four fifths or half are wrong, not between.
