@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.solvers.backbone.chain import believed, sequential_edges
@@ -38,7 +39,7 @@ def test_steps_that_state_nothing_of_some_axes(dimension: int, world: str, seed:
     assert (found.kept & made.right).sum() >= 0.9 * made.right.sum()
     assert "as loops show them" in " ".join(found.notes)
     for poses in (found.world_from_cam, solve_robust(graph).world_from_cam):
-        assert made.error_m(poses) < max(1.5 * made.error_m(as_stated.world_from_cam), 0.6 * odometry_m)
+        assert made.error_m(poses) < max(1.5 * made.error_m(as_stated.world_from_cam), 0.65 * odometry_m)
         assert made.error_m(poses) <= NEVER_WORSE * odometry_m
 
 
@@ -52,8 +53,10 @@ def test_what_is_believed_of_steps() -> None:
     assert not as_stated
     np.testing.assert_array_equal(changed.information[~steps], graph.information[~steps])
     errors = np.sqrt(np.diag(np.linalg.inv(changed.information[steps][0])))
-    np.testing.assert_allclose(errors[3:], np.sqrt(1e-3), rtol=1e-6)
-    assert (errors[:3] < 0.1).all() and np.ptp(errors[:3]) < 1e-9
+    np.testing.assert_allclose(errors[3:5], np.sqrt(1e-3), rtol=1e-6)
+    moved = se3.log(graph.i_from_j[steps])
+    np.testing.assert_allclose(errors[5], 0.2 * np.sqrt(np.mean(moved[:, 3:] ** 2)), rtol=1e-6)
+    np.testing.assert_allclose(errors[:3], 0.2 * np.sqrt(np.mean(moved[:, :3] ** 2)), rtol=1e-6)
     nothing, as_stated = believed(graph, np.zeros_like(steps))
     assert nothing is graph and as_stated
 

@@ -203,8 +203,8 @@ not know.
 
 def believed(graph: ViewGraph, steps: Bools) -> tuple[ViewGraph, bool]:
     """The graph with what is believed of its steps (E,), and whether that is what they state: an axis of which most of
-    them state nothing errs as the others of its kind do, or by `MOST_OF_A_STEP` where nothing is stated of any. Of
-    unknown information, the identity, nothing is changed.
+    them state nothing errs as the others of its kind do, or by `MOST_OF_A_STEP` where that is more. Of unknown
+    information, the identity, nothing is changed.
     """
     rows, axes = np.flatnonzero(steps), free_axes(graph)
     if has_unit_information(graph) or not len(rows):
@@ -216,8 +216,8 @@ def believed(graph: ViewGraph, steps: Bools) -> tuple[ViewGraph, bool]:
         step = float(np.sqrt(np.mean(moved[:, part] ** 2)))
         told = usual[part] <= (least or max(step, NOTHING_TIMES * usual[part].min()))
         if not told.all() and step > 0:
-            mean = np.sqrt(np.mean(spread[:, part[told]] ** 2, axis=1)) if told.any() else MOST_OF_A_STEP * step
-            factor[:, part[~told]] = (mean / spread[:, part[~told]].T).T
+            others = np.sqrt(np.mean(spread[:, part[told]] ** 2, axis=1)) if told.any() else 0.0
+            factor[:, part[~told]] = (np.maximum(others, MOST_OF_A_STEP * step) / spread[:, part[~told]].T).T
     if (factor == 1).all():
         return graph, True
     information = graph.information.copy()
