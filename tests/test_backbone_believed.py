@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.robust import solve_robust
+from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.solvers.backbone.chain import believed, sequential_edges
 from hodge_pipeline.types import Floats, ViewGraph
 from tests.backbone_graphs import drive
@@ -69,3 +71,9 @@ def test_a_direction_that_few_steps_do_not_measure_is_as_stated() -> None:
     information[sliding, 3, 3] = 1e-3
     stated = replace(graph, information=information)
     assert believed(stated, sequential_edges(graph))[0] is stated
+
+
+@pytest.mark.parametrize("name", ["parking-garage", "cubicle"])
+def test_information_of_a_radian_or_of_one_axis_that_is_known_far_better_is_believed(data_dir: Path, name: str) -> None:
+    graph = read_graph(data_dir / f"pose_graphs/sesync/{name}.g2o").graph
+    assert graph is not None and believed(graph, sequential_edges(graph))[1]
