@@ -30,7 +30,11 @@ def keep_memory() -> None:
         mallopt(_TRIM_THRESHOLD, MOST_KEPT)
 
 
-def give_back_memory() -> None:
-    """Give back what was freed, wherever it lies in the heap; nothing where the C library is not glibc."""
+def give_back_memory(cycles: bool) -> None:
+    """Give back what was freed, wherever it lies in the heap, also of `cycles` of objects; of the heap nothing where the
+    C library is not glibc.
+    """
+    if cycles:
+        gc.collect()
     with suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)

@@ -37,6 +37,8 @@ RECORD, KEY, INDEX = "step.json", "key.txt", "index.json"
 """Of a finished step: its key, the hash of each file, notes, cost; of a begun one: its key; of a run: its steps."""
 HASHED_AT_ONCE = 1 << 22
 """Bytes."""
+LONG_CPU_S = 10.0
+"""Of a step, after which cycles of objects are looked for too: that takes .07 s."""
 
 
 @cache
@@ -76,8 +78,8 @@ class Store:
         if self._is_whole(path, key):
             log.info("%s: already done", title)
         else:
-            self._compute(path, key, title, total, partial(function, *inputs, **resources))
-            self._give_back_memory()
+            cost = self._compute(path, key, title, total, partial(function, *inputs, **resources))
+            self._give_back_memory(cost.cpu_s >= LONG_CPU_S)
         self.note(*(Note(**note) for note in _unsealed(path / RECORD)["notes"]))
         value: T = codec.load(path, kind)
         self.remember(value, key)
@@ -150,7 +152,7 @@ class Store:
             return False
         return True
 
-    def _compute(self, path: Path, key: str, title: str, total: int, function: Callable[..., Any]) -> None:
+    def _compute(self, path: Path, key: str, title: str, total: int, function: Callable[..., Any]) -> Cost:
         part = path.with_name(f"{path.name}.part")
         notes: dict[Note, None] = {}
         log.info("%s: begins", title)
@@ -169,13 +171,14 @@ class Store:
             _seal(part / RECORD, {**facts, "versions": versions(), "cost": vars(cost)})
             _commit(part, path)
         log.info("%s: %.1f s wall, %.1f s CPU, %.0f MB", title, cost.wall_s, cost.cpu_s, cost.peak_mb)
+        return cost
 
-    def _give_back_memory(self) -> None:
+    def _give_back_memory(self, was_long: bool) -> None:
         """Of what a step has read of clouds and has freed, which the next one would be charged with."""
         for value, _ in self._keys.values():
             if isinstance(value, CloudSet):
                 value.forget()
-        give_back_memory()
+        give_back_memory(cycles=was_long)
 
     def _listed(self, name: str, function: str, title: str) -> None:
         """Keep the list of the steps so far, in order, without those that another run of this folder left."""
