@@ -31,8 +31,8 @@ def keep_memory() -> None:
 
 
 def give_back_memory(cycles: bool) -> None:
-    """Give back what was freed, wherever it lies in the heap, also of `cycles` of objects; of the heap nothing where the
-    C library is not glibc.
+    """Give back what was freed, wherever it lies in the heap, after a look for `cycles` of objects; nothing of the heap
+    where the C library is not glibc.
     """
     if cycles:
         gc.collect()
