@@ -296,3 +296,8 @@ def test_positions_that_are_known_in_space(tmp_path):
     np.testing.assert_array_equal(priors.information[:, :3], 0)
     np.testing.assert_array_equal(priors.information[0, 3:, 3:], [[10, 1, 0], [1, 20, 0], [0, 0, 30]])
     np.testing.assert_array_equal(priors.information[1, 3:, 3:], np.diag([40, 50, 0]))
+
+
+def test_toro_edges_without_information_are_counted(tmp_path):
+    source = load_toro(write(tmp_path / "a.graph", "EDGE2 0 1 1 2 0.5", "EDGE2 1 2 1 2 0.5"))
+    assert "2 edges state no information: taken as unknown" in source.notes

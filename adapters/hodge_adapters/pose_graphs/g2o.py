@@ -91,18 +91,19 @@ class Half:
     prior_information: Floats = field(default_factory=lambda: np.zeros((0, 6, 6)))
 
 
-def _spatial(records: dict[str, Records]) -> Half:
+def _spatial(records: dict[str, Records], notes: list[str]) -> Half:
     vertices, edges = records["VERTEX_SE3:QUAT"], records["EDGE_SE3:QUAT"]
-    information = _triangles(edges, 6)
-    information = information_of_file(information) if _states(edges) else information
+    information = np.tile(np.eye(6), (len(edges), 1, 1))
+    if has_information(edges, 7, notes):
+        information = information_of_file(upper_triangle(edges.values[:, 7:], 6))
     poses, motions = spatial_poses(vertices), spatial_poses(edges)
     plain, levered = records[g2o_priors.SPATIAL], records[g2o_priors.SPATIAL_OFFSET]
     parameters = records[g2o_priors.OFFSET]
     offsets = g2o_priors.offsets_of(levered, parameters, spatial_poses(parameters))
     known = [information_of_file(upper_triangle(prior.values[:, 7:], 6)) for prior in (plain, levered)]
     moved, moved_information = g2o_priors.moved_to_body(spatial_poses(levered), known[1], offsets)
-    on_position = [records[tag] for tag in (g2o_priors.SPATIAL_XYZ, g2o_priors.SPATIAL_XY)]
-    places, of_places = zip(*map(g2o_priors.positions, on_position), strict=True)
+    on_position = records[g2o_priors.SPATIAL_XYZ], records[g2o_priors.SPATIAL_XY]
+    places, of_places = zip(*map(_positions, on_position, (3, 2)), strict=True)
     return Half(
         vertices.keys[:, 0],
         poses,
@@ -115,20 +116,28 @@ def _spatial(records: dict[str, Records]) -> Half:
     )
 
 
-def _triangles(edges: Records, size: int) -> Floats:
-    """The information (E, size, size) of edges; the identity, which stands for unknown, where they state none."""
-    triangles = edges.values[:, -size * (size + 1) // 2 :] if _states(edges) else np.eye(size)[np.triu_indices(size)]
-    return upper_triangle(np.broadcast_to(triangles, (len(edges), size * (size + 1) // 2)), size)
+def has_information(edges: Records, motion: int, notes: list[str]) -> bool:
+    """Whether numbers follow those of each edge's motion; a note says where none do. Without edges they do."""
+    stated = bool(edges.values.shape[1] > motion)
+    if not stated:
+        notes.append(f"{counted(len(edges), 'edge states|edges state')} no information: taken as unknown")
+    return stated
 
 
-def _states(edges: Records) -> bool:
-    """Whether the information follows the motion."""
-    return edges.values.shape[1] in (SPATIAL_EDGE[0], PLANAR_EDGE[0])
+def _positions(known: Records, size: int) -> tuple[Floats, Floats]:
+    """Poses (P, 4, 4) at known positions of so many coordinates, and the information (P, 6, 6) on these alone."""
+    beside = (0, 3 - size)
+    at = np.pad(known.values[:, :size], ((0, 0), beside))
+    around = ((0, 0), (3, beside[1]), (3, beside[1]))
+    information = np.pad(upper_triangle(known.values[:, size:], size), around)
+    return se3.from_parts(np.broadcast_to(np.eye(3), (len(at), 3, 3)), at), information
 
 
-def _planar(records: dict[str, Records]) -> Half:
+def _planar(records: dict[str, Records], notes: list[str]) -> Half:
     vertices, edges = records["VERTEX_SE2"], records["EDGE_SE2"]
-    information = lift_information(_triangles(edges, 3))
+    information = np.tile(np.eye(3), (len(edges), 1, 1))
+    if has_information(edges, 3, notes):
+        information = upper_triangle(edges.values[:, 3:], 3)
     poses, motions = lift_poses(vertices.values), lift_poses(edges.values[:, :3])
     whole, position = records[g2o_priors.PLANAR], records[g2o_priors.PLANAR_POSITION]
     anywhere = np.pad(position.values[:, :2], ((0, 0), (0, 1)))
@@ -138,7 +147,7 @@ def _planar(records: dict[str, Records]) -> Half:
         poses,
         edges.keys,
         motions,
-        information,
+        lift_information(information),
         np.concatenate([whole.keys[:, 0], position.keys[:, 0]]),
         lift_poses(np.concatenate([whole.values[:, :3], anywhere])),
         lift_information(np.concatenate([upper_triangle(whole.values[:, 3:], 3), on_position])),
@@ -212,16 +221,15 @@ SPATIAL_TAGS = (
     *(g2o_priors.SPATIAL_XYZ, g2o_priors.SPATIAL_XY),
 )
 PLANAR_TAGS = ("VERTEX_SE2", g2o_priors.PLANAR, g2o_priors.PLANAR_POSITION)
-SPATIAL_EDGE, PLANAR_EDGE = (28, 7), (9, 3)
-"""Numbers of an edge with its information, and without, as LIO-SAM's descendants write it."""
 COLUMNS = {
     "VERTEX_SE3:QUAT": (7,),
-    "EDGE_SE3:QUAT": SPATIAL_EDGE,
+    "EDGE_SE3:QUAT": (28, 7),
     "VERTEX_SE2": (3,),
-    "EDGE_SE2": PLANAR_EDGE,
+    "EDGE_SE2": (9, 3),
     "FIX": None,
     **g2o_priors.COLUMNS,
 }
+"""Edges without information are what LIO-SAM's descendants write."""
 
 
 def load_g2o(path: Path | str) -> Source:
@@ -239,14 +247,12 @@ def load_g2o(path: Path | str) -> Source:
         raise SourceError(f"{path}: no g2o vertex or edge in it: expected lines such as EDGE_SE3:QUAT or EDGE_SE2")
     more_planar = len(records["VERTEX_SE2"]) > len(records["VERTEX_SE3:QUAT"])
     dimension = 2 if planar or (not spatial and more_planar) else 3
-    half = _planar(records) if dimension == 2 else _spatial(records)
+    told: list[str] = []
+    half = (_planar if dimension == 2 else _spatial)(records, told)
     strange = {tag: len(records[tag]) for tag in (SPATIAL_TAGS if dimension == 2 else PLANAR_TAGS) if len(records[tag])}
-    notes = skipped({**other, **strange})
+    notes = skipped({**other, **strange}) + told
     for tag, what in (("VERTEX_SE3:QUAT", "vertices"), ("EDGE_SE3:QUAT", "edges")):
         notes += length_notes(records[tag].values[:, 3:7], what)
-    edges = records["EDGE_SE2" if dimension == 2 else "EDGE_SE3:QUAT"]
-    if len(edges) and not _states(edges):
-        notes.append(f"{counted(len(edges), 'edge states|edges state')} no information: taken as unknown")
     fixed_keys = records["FIX"].keys.reshape(-1)
     absent = np.setdiff1d(fixed_keys, np.concatenate([half.vertex_keys, half.edge_keys.reshape(-1)]))
     if len(absent):

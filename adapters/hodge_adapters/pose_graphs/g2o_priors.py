@@ -29,19 +29,6 @@ Positions alone, in space, are what hdl_graph_slam writes of GPS.
 """
 
 
-def positions(records: Records) -> tuple[Floats, Floats]:
-    """Poses (P, 4, 4) at known positions in space, and the information (P, 6, 6): none of rotations and of a height
-    that is not given.
-    """
-    size = 3 if records.values.shape[1] == 9 else 2
-    at, information = np.zeros((len(records), 3)), np.zeros((len(records), 6, 6))
-    at[:, :size] = records.values[:, :size]
-    rows, columns = np.triu_indices(size)
-    told = records.values[:, size:]
-    information[:, 3 + rows, 3 + columns] = information[:, 3 + columns, 3 + rows] = told
-    return se3.from_parts(np.broadcast_to(np.eye(3), (len(at), 3, 3)), at), information
-
-
 def offsets_of(priors: Records, parameters: Records, offsets: Floats) -> Floats:
     """The motion body_from_sensor (P, 4, 4) that each prior names."""
     known = {int(key): row for row, key in enumerate(parameters.keys[:, 0])}

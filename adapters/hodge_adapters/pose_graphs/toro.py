@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from hodge_adapters.pose_graphs.g2o import (
     Half,
     as_source,
+    has_information,
     lift_information,
     lift_poses,
     refuse_landmarks_alone,
@@ -44,10 +45,10 @@ def euler_motions(values: Floats) -> Floats:
     return se3.from_parts(rotation, values[:, :3])
 
 
-def _spatial(records: dict[str, Records]) -> Half:
+def _spatial(records: dict[str, Records], notes: list[str]) -> Half:
     vertices, edges = records["VERTEX3"], records["EDGE3"]
     information = np.broadcast_to(np.eye(6), (len(edges), 6, 6))
-    if edges.values.shape[1] > 6:
+    if has_information(edges, 6, notes):
         information = np.roll(upper_triangle(edges.values[:, 6:], 6), (3, 3), axis=(1, 2))
     poses, motions = euler_motions(vertices.values), euler_motions(edges.values)
     return Half(vertices.keys[:, 0], poses, edges.keys, motions, np.array(information))
@@ -56,7 +57,7 @@ def _spatial(records: dict[str, Records]) -> Half:
 def _planar(records: dict[str, Records], notes: list[str]) -> Half:
     vertices, edges = records["VERTEX2"], records["EDGE2"]
     information = np.broadcast_to(np.eye(3), (len(edges), 3, 3))
-    if edges.values.shape[1] > 3:
+    if has_information(edges, 3, notes):
         raw = edges.values[:, 3:]
         by_rows = not len(vertices) and bool((raw[:, 2] == 0).any())
         if by_rows:
@@ -96,7 +97,7 @@ def load_toro(path: Path | str) -> Source:
         refuse_landmarks_alone(path, other)
         raise SourceError(f"{path}: no TORO edge in it: expected lines such as EDGE3 or EDGE2")
     notes = skipped(other)
-    half = _planar(records, notes) if planar else _spatial(records)
+    half = (_planar if planar else _spatial)(records, notes)
     if len(equal := records["EQUIV"].keys):
         half = _merge(half, equal)
         notes.append(f"{len(equal)} EQUIV lines: those vertices are merged")
