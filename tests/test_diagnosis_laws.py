@@ -184,6 +184,18 @@ def test_information_that_explains_nearly_all_cycles_is_believed() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
+def test_steps_that_state_their_errors_are_not_judged_by_the_unit_of_loops(seed: int) -> None:
+    """Loops that state hundreds of times their errors, as a constant covariance does, and steps that state their own."""
+    poses, steps, loops = poses_on_a_ring(60), *np.split(near_pairs(60, 4), [60])
+    one, others = measured(poses, steps, seed), measured(poses, loops, seed + 1, noise=0.2)
+    stated = SIGMA * np.repeat([1, 30], (len(steps), len(loops)))[:, None]
+    information = np.eye(6) / stated[:, :, None] ** 2
+    edges, motion = np.concatenate([steps, loops]), np.concatenate([one.i_from_j, others.i_from_j])
+    graph = ViewGraph.from_edges(np.arange(60), edges, motion, information)
+    assert diagnose(graph, DiagnosisOptions(trust=NONE)).kept.all()
+
+
+@pytest.mark.parametrize("seed", range(3))
 def test_what_the_information_states_holds_where_the_poses_are_and_not_where_they_turn_about(seed: int) -> None:
     """Poses on a sphere of 100 m turn about its middle, where an error of rotation is a hundred times as far."""
     number = np.arange(64)

@@ -80,7 +80,8 @@ def edge_noise(
     within bounds: errors as large as the motions would let any loop close, and errors as small as those of rounding
     none.
     """
-    rotation, translation, informed = _proportions(graph, there)
+    own, informed = _stated(graph, there)
+    rotation, translation = map(_proportions, own)
     short = np.flatnonzero(loops.lengths <= LONGEST_CYCLE)
     any_cycle, loops = len(loops) > 0, loops.select(short)
     turned, shifted = _Errors(loops, rotation, angle[short]), _Errors(loops, translation, displacement_m[short])
@@ -100,7 +101,7 @@ def edge_noise(
     changed = any(own and not 1 / TOLD_FROM < by < TOLD_FROM for own, by in zip(taken, believed, strict=True))
     is_reported = informed and changed and any_cycle and not has_unit_information(graph)
     doubts = (_doubt(stated, (turn * stated[0], shift * stated[1])),) if is_reported else ()
-    return Noise(turn * rotation, shift * translation, doubts)
+    return Noise(_scaled(turn, rotation, own[0]), _scaled(shift, translation, own[1]), doubts)
 
 
 def recentred(graph: ViewGraph, point: Floats) -> ViewGraph:
@@ -134,19 +135,32 @@ def _doubt(stated: tuple[float, float], taken: tuple[float, float]) -> str:
     )
 
 
-def _proportions(graph: ViewGraph, there: ViewGraph) -> tuple[Floats, Floats, bool]:
-    """Standard deviations at the working point by the information, or ones where it is the identity for every edge."""
+def _stated(graph: ViewGraph, there: ViewGraph) -> tuple[tuple[Floats, Floats], bool]:
+    """Standard deviations (E,) of rotation and of translation that the information states at the working point, ∞ where
+    it states none; ones where it is the identity for every edge.
+    """
     same = graph.edge_count < 2 or bool((graph.information == graph.information[:1]).all())
     if same and (not graph.edge_count or np.array_equal(graph.information[0], np.eye(6))):
-        return np.ones(graph.edge_count), np.ones(graph.edge_count), False
+        return (np.ones(graph.edge_count), np.ones(graph.edge_count)), False
     rotation, translation = mean_variances(there, graph.dimension == 2)
-    return _deviation(1 / rotation), _deviation(1 / translation), True
+    return (_deviation(rotation), _deviation(translation)), True
 
 
-def _deviation(precision: Floats) -> Floats:
-    positive = precision > 0
-    usual = float(np.median(precision[positive])) if positive.any() else 1.0
-    return np.asarray(1 / np.sqrt(np.clip(np.where(positive, precision, usual), usual / 10, usual * 10)))
+def _deviation(variance: Floats) -> Floats:
+    return np.asarray(np.sqrt(np.where(variance > 0, variance, np.inf)))
+
+
+def _proportions(stated: Floats) -> Floats:
+    """Standard deviations (E,) within the square root of ten of the usual one, which an edge that states none has."""
+    usual = float(np.median(stated[np.isfinite(stated)])) if np.isfinite(stated).any() else 1.0
+    return np.clip(np.where(np.isfinite(stated), stated, usual), usual / math.sqrt(10), usual * math.sqrt(10))
+
+
+def _scaled(scale: float, proportions: Floats, stated: Floats) -> Floats:
+    """Errors (E,) by their scale. One that shrinks them leaves an edge what it states itself, up to the usual error:
+    odometry and loops often state theirs in different units, and the scale is that of the loops.
+    """
+    return np.maximum(scale * proportions, np.minimum(stated, scale * _median(proportions)))
 
 
 class _Errors:
