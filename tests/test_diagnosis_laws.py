@@ -185,7 +185,7 @@ def test_information_that_explains_nearly_all_cycles_is_believed() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_steps_that_state_their_errors_are_not_judged_by_the_unit_of_loops(seed: int) -> None:
-    """Loops that state hundreds of times their errors, as a constant covariance does, and steps that state their own."""
+    """Loops that state hundreds of times their errors, as a constant covariance does, and steps that state theirs."""
     poses, steps, loops = poses_on_a_ring(60), *np.split(near_pairs(60, 4), [60])
     one, others = measured(poses, steps, seed), measured(poses, loops, seed + 1, noise=0.2)
     stated = SIGMA * np.repeat([1, 30], (len(steps), len(loops)))[:, None]
