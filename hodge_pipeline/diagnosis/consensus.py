@@ -56,7 +56,8 @@ def best_arrangement(evidence: Evidence, start: Fit) -> Fit:
     """
     if not 2 < evidence.graph.vertex_count <= LARGEST:
         return start
-    starts = start, fit(evidence, _in_order(evidence), TWICE)
+    in_order = fit(evidence, _in_order(evidence), TWICE)
+    starts = (start,) if np.array_equal(start.used, in_order.used) else (start, in_order)
     found = [fit(evidence, align(evidence, searched(evidence, begun)), ONCE) for begun in starts]
     models = [learn_scene_model(evidence, one) for one in found]
     values = [sum(arrangement_log_evidence(evidence, one, model) for model in models) for one in found]

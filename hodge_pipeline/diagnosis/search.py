@@ -25,7 +25,7 @@ from hodge_pipeline.types import Bools, Floats, Ints
 LARGEST = 150
 """Views: with more, all pairs of them would cost too much."""
 ROUNDS = 10
-TRIED = 60
+TRIED = 200
 """Motions in each round."""
 MOST_PROPOSALS = 1000
 """Edges that propose one, those likeliest by the order of the views."""
@@ -89,6 +89,8 @@ def _moves(here: Placements) -> list[Move]:
     in_order = (np.abs(j - i) == 1) & (here.usual > 0)
     urgent = PER_FOLD * np.log1p(np.asarray(proposals.alike.sum(axis=1)).ravel())
     urgent += np.where(in_order, sure, 0.0)[proposals.edge]
+    turned = proposals.motion[:, :3, :3] @ here.found.poses[proposals.mover, :3, :3]
+    urgent += here.held(turned, here.up[proposals.stayer])
     left = np.ones(len(proposals.mover), bool)
     moves: list[Move] = []
     while left.any() and len(moves) < TRIED:
