@@ -17,7 +17,6 @@ import pytest
 
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.registration.gicp import Gicp
-from hodge_pipeline.registration.tracked_blocks import _empty_file
 from hodge_pipeline.stages import Step
 from hodge_pipeline.store import artifacts, codec
 from hodge_pipeline.store import cost as cost_module
@@ -386,10 +385,3 @@ def test_a_file_of_two_names_leaves_no_draft(tmp_path: Path) -> None:
     for _ in range(2):
         artifacts.link_or_copy(tmp_path / "made", tmp_path / "shown")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["made", "shown"]
-
-
-def test_a_file_that_is_mapped_has_its_room_on_the_disk(tmp_path: Path) -> None:
-    column = _empty_file(tmp_path / "points.npy", (1000, 3), np.dtype(np.float32))
-    assert os.stat(tmp_path / "points.npy").st_blocks * 512 >= column.nbytes
-    column[:] = 1
-    assert np.load(tmp_path / "points.npy").sum() == 3000
