@@ -186,12 +186,13 @@ class Edges:
         pairs = np.asarray(pairs, np.int64).reshape(-1, 2)
         count = len(pairs)
         number, word, whole = np.full(count, np.nan), np.full(count, ""), np.zeros(count, np.int64)
+        nothing = np.array(np.nan)  # seen in every element, which takes no memory
         return cls(
             pairs=pairs,
             proposed_by=np.full(count, proposed_by),
             overlap=number,
-            i_from_j=np.full((count, 4, 4), np.nan),
-            information=np.full((count, 6, 6), np.nan),
+            i_from_j=np.broadcast_to(nothing, (count, 4, 4)),
+            information=np.broadcast_to(nothing, (count, 6, 6)),
             fitness=number,
             rmse_m=number,
             correspondences=whole,
@@ -282,3 +283,5 @@ class Edges:
 
 MEASURED = ("i_from_j", "information", "fitness", "rmse_m", "correspondences")
 """The columns that `Edges` and `ViewGraph` have in common."""
+REGISTERED = (*MEASURED, "iterations", "converged")
+"""The columns of what a registrar finds."""
