@@ -48,7 +48,7 @@ class Round:
     name: str = "odometry"
     position_fit: PositionFit | None = None
 
-    @cached_property
+    @property
     def graph_edges(self) -> Edges:
         """The rows that are edges, in the order of `graph`: those that count, and those that are off by hand."""
         return self.edges.select(self.edges.in_graph)
