@@ -56,7 +56,7 @@ class Round:
     @cached_property
     def graph(self) -> ViewGraph:
         """The viewing graph."""
-        return self.graph_edges.as_graph(self.vertex_ids)
+        return self.edges.as_graph(self.vertex_ids, self.edges.in_graph)
 
     @property
     def rejected(self) -> Edges:

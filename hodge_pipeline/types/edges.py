@@ -275,10 +275,11 @@ class Edges:
         reasons, counts = np.unique(self.why[self.status == REJECTED], return_counts=True)
         return dict(zip(reasons.tolist(), counts.tolist(), strict=True))
 
-    def as_graph(self, vertex_ids: ArrayLike) -> ViewGraph:
-        """The viewing graph of all rows, each of which has a motion: `select` first."""
-        columns = {name: getattr(self, name) for name in MEASURED}
-        return ViewGraph(vertex_ids=np.asarray(vertex_ids), edges=self.pairs, source=self.proposed_by, **columns)
+    def as_graph(self, vertex_ids: ArrayLike, rows: Ints | Bools | slice = slice(None)) -> ViewGraph:
+        """The viewing graph of these rows, each of which has a motion."""
+        columns = {name: getattr(self, name)[rows] for name in MEASURED}
+        pairs, source = self.pairs[rows], self.proposed_by[rows]
+        return ViewGraph(vertex_ids=np.asarray(vertex_ids), edges=pairs, source=source, **columns)
 
 
 MEASURED = ("i_from_j", "information", "fitness", "rmse_m", "correspondences")
