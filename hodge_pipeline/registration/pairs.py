@@ -141,6 +141,7 @@ def register_pairs(
 def _register_block(folder: Path, registrar: Registrar, block: tuple[Ints, Floats]) -> Edges:
     prepared, pairs = prepared_clouds(folder, registrar), block[0]
     found = [registrar.register(prepared[i], prepared[j], guess) for (i, j), guess in zip(*block, strict=True)]
+    prepared.clouds.forget()  # they stay open for the next block
     return Edges.of(pairs).with_registrations(found)
 
 
