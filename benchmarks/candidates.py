@@ -27,7 +27,7 @@ from hodge_pipeline.registration.odometry import OdometryOptions, odometry
 from hodge_pipeline.stages import GlobalRegistrar, Workers
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.start.unordered.start import LocalDescriptors, all_pairs, similar_pairs
-from hodge_pipeline.types import CloudSet, Ints
+from hodge_pipeline.types import Ints
 
 REACH = 5
 TIMED_PAIRS = 200
@@ -66,9 +66,7 @@ def main() -> None:
     truth = np.array([frame.world_from_cam for frame in frames])
     with tempfile.TemporaryDirectory() as name, LocalExecutor(workers=0).open() as workers:
         folder = Path(name)
-        clouds, _ = prepare_clouds(frames, CloudOptions(landmarks=1000), workers)
-        clouds.save(folder)
-        clouds = CloudSet.open(folder)
+        clouds, _ = prepare_clouds(frames, CloudOptions(landmarks=1000), workers, folder)
         stamps = np.array([frame.stamp_s for frame in frames])
         drifted = odometry(folder, [rows], stamps, OdometryOptions(), workers).world_from_cam
         true = far(OverlapEdges(min_iou=0.3).propose(frames, clouds, truth).pairs)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -65,9 +66,10 @@ def compute(job: Job, recording: Recording) -> Computed:
         work = Work(recipe, store, scene, measured(job, scene), workers, fixes)
         rounds = [scene.first]
         edited = edited_rounds(work, job.folder, rounds)
-        for registered in chain(proposed_rounds(work, rounds), suggested_rounds(work, rounds), edited):
-            rounds.append(consistent(work, registered))
-            recording.round(len(rounds) - 1, rounds[-1])
+        registered = chain(proposed_rounds(work, rounds), suggested_rounds(work, rounds), edited)
+        for solved in map(partial(consistent, work), registered):
+            rounds.append(solved)
+            recording.round(len(rounds) - 1, solved)
         recording.diagnosis(rounds[-1])
         scores = score(job, work, rounds)
         recording.scores(scores)
@@ -82,8 +84,7 @@ def proposed_rounds(work: Work, rounds: Sequence[Round]) -> Iterator[Registered]
     """The outer iterations: pairs proposed and registered from the last of `rounds`, which the caller extends."""
     for number in range(1, work.recipe.outer_iterations + 1):
         before = rounds[-1] if number > 1 else work.placed_first()
-        proposed = work.propose(number, before)
-        yield work.register(number, proposed, before)
+        yield work.register(number, work.propose(number, before), before)
 
 
 def consistent(work: Work, registered: Registered) -> Round:

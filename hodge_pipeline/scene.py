@@ -48,7 +48,7 @@ class Round:
     name: str = "odometry"
     position_fit: PositionFit | None = None
 
-    @cached_property
+    @property
     def graph_edges(self) -> Edges:
         """The rows that are edges, in the order of `graph`: those that count, and those that are off by hand."""
         return self.edges.select(self.edges.in_graph)
@@ -56,7 +56,7 @@ class Round:
     @cached_property
     def graph(self) -> ViewGraph:
         """The viewing graph."""
-        return self.graph_edges.as_graph(self.vertex_ids)
+        return self.edges.as_graph(self.vertex_ids, self.edges.in_graph)
 
     @property
     def rejected(self) -> Edges:

@@ -6,7 +6,7 @@ A stage is found by name through the entry points `hodge_pipeline.<kind>` (see `
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -163,6 +163,16 @@ class Workers(Protocol):
         The task is a module-level function or a partial of one. A worker that dies costs its blocks a retry;
         `WorkerError` after several. An error that the task raises is raised here.
         """
+
+
+def in_order(finished: Iterable[tuple[int, Result]]) -> Iterator[Result]:
+    """The results of `Workers.map` in the order of their blocks; one that comes early waits for those before it."""
+    early, number = dict[int, Result](), 0
+    for index, result in finished:
+        early[index] = result
+        while number in early:
+            yield early.pop(number)
+            number += 1
 
 
 @runtime_checkable

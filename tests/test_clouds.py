@@ -1,5 +1,6 @@
 """From frames to clouds: hand answers, order, colours, and what happens to frames that give nothing."""
 
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,8 +16,10 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.executors.local import InProcess
 from hodge_pipeline.registration import clouds as clouds_module
 from hodge_pipeline.registration import voxel_means
-from hodge_pipeline.registration.clouds import CloudOptions, make_cloud, prepare_clouds
-from hodge_pipeline.types import Camera, CloudSet, Frame, PointCloud
+from hodge_pipeline.registration.clouds import FRAMES_IN_BLOCK, CloudOptions, make_cloud, prepare_clouds
+from hodge_pipeline.stages import Step
+from hodge_pipeline.start.clouds import add_landmarks
+from hodge_pipeline.types import Camera, CloudSet, Frame, PointCloud, Source
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
 WALL_M = 1.995  # the middle of a 3 cm voxel, so that rounding never splits the wall in two
@@ -27,6 +30,20 @@ class Backwards:
 
     def map(self, task: Callable[[Any], Any], blocks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
         return ((row, task(blocks[row])) for row in reversed(range(len(blocks))))
+
+
+class Counting:
+    """Workers that count how many sets of clouds that they made are held at once."""
+
+    def __init__(self) -> None:
+        self._held, self.most = weakref.WeakSet[CloudSet](), 0
+
+    def map(self, task: Callable[[Any], Any], blocks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        for row, block in enumerate(blocks):
+            result = task(block)
+            self._held.add(result if isinstance(result, CloudSet) else result[0])
+            self.most = max(self.most, len(self._held))
+            yield row, result
 
 
 def wall(z: float) -> np.ndarray:
@@ -124,19 +141,19 @@ def test_no_returns_of_scans_are_counted_in_one_note(tmp_path: Path) -> None:
     cloud = points_of_columns(tmp_path, dict(zip("xyz", table.T, strict=True)))
     assert (len(cloud), cloud.no_numbers) == (38, 2)
     scans = [Frame(k, float(k), read_points=lambda: cloud) for k in range(2)]
-    _, notes = prepare_clouds(scans, CloudOptions(), InProcess())
+    _, notes = prepare_clouds(scans, CloudOptions(), InProcess(), tmp_path)
     assert notes == ("14 of 80 points (17.5%) are no returns (zero, or no number): left out",)
     holes = wall(WALL_M)
     holes[:9] = 0
-    assert prepare_clouds([frame(holes)], CloudOptions(), InProcess())[1] == ()
+    assert prepare_clouds([frame(holes)], CloudOptions(), InProcess(), tmp_path)[1] == ()
 
 
-def test_clouds_come_in_the_order_of_the_frames_and_bad_frames_are_said() -> None:
+def test_clouds_come_in_the_order_of_the_frames_and_bad_frames_are_said(tmp_path: Path) -> None:
     frames = [frame(wall(0.5 + 0.1 * k), k) for k in range(40)]
     frames[7] = Frame(7, 7.0, CAMERA, read_depth=unreadable)
     frames[9] = frame(wall(0.0), 9)
     done: list[int] = []
-    clouds, notes = prepare_clouds(frames, CloudOptions(), Backwards(), done.append)
+    clouds, notes = prepare_clouds(frames, CloudOptions(), Backwards(), tmp_path, done.append)
     depths = [cloud.points_in_cam[:, 2].mean() for row, cloud in enumerate(clouds) if row not in (7, 9)]
     assert np.allclose(depths, [0.5 + 0.1 * k for k in range(40) if k not in (7, 9)], atol=1e-5)
     assert clouds.sizes[[7, 9]].tolist() == [0, 0]
@@ -145,10 +162,28 @@ def test_clouds_come_in_the_order_of_the_frames_and_bad_frames_are_said() -> Non
     assert sum(done) == 40
 
 
-def test_of_many_frames_with_the_same_fault_the_first_are_named_and_the_others_counted() -> None:
+def test_clouds_and_landmarks_are_written_as_they_are_made(tmp_path: Path) -> None:
+    """Of 20,000 frames landmarks have half a gigabyte; the points, which stay the same, lie on the disk once."""
+    seen = np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8)
+    frames = tuple(frame(wall(1.0 + 0.001 * k), k, read_colour=lambda: seen) for k in range(10 * FRAMES_IN_BLOCK))
+    workers, options = Counting(), CloudOptions(landmarks=20)
+    bare, _ = prepare_clouds(frames, CloudOptions(), workers, tmp_path / "bare")
+    step = Step(tmp_path, lambda _: None, lambda *_: None)
+    found = add_landmarks(Source("wall", tmp_path, frames), bare, options, workers=workers, step=step)
+    assert workers.most <= 3
+    whole = CloudSet.from_clouds([make_cloud(one, options)[0] for one in frames])
+    assert whole.marks[-1] > len(frames)
+    for name in CloudSet.FILES:
+        assert np.array_equal(getattr(found, name), getattr(whole, name)), name
+    assert (tmp_path / "clouds" / "points.npy").samefile(tmp_path / "bare" / "points.npy")
+    add_landmarks(Source("wall", tmp_path, frames[:1]), bare, options, workers=workers, step=step)
+    assert np.array_equal(np.load(tmp_path / "bare" / "points.npy"), whole.points), "it was written over"
+
+
+def test_of_many_frames_with_the_same_fault_the_first_are_named_and_the_others_counted(tmp_path: Path) -> None:
     frames = [frame(wall(WALL_M), k, read_colour=unreadable) for k in range(40)]
     frames[30] = frame(wall(0.0), 30)
-    _, notes = prepare_clouds(frames, CloudOptions(), InProcess())
+    _, notes = prepare_clouds(frames, CloudOptions(), InProcess(), tmp_path)
     assert [note.split(":")[0] for note in notes[:6]] == [*(f"frame {k}" for k in range(5)), "frame 30"]
     assert notes[6:] == ("34 more frames: its cloud has no colours, as of those before",)
 
@@ -162,24 +197,24 @@ def test_of_many_frames_with_the_same_fault_the_first_are_named_and_the_others_c
     ],
     ids=["black", "blue", "underexposed"],
 )
-def test_frames_whose_colour_image_shows_nothing_are_said(seen: np.ndarray, said: bool) -> None:
+def test_frames_whose_colour_image_shows_nothing_are_said(seen: np.ndarray, said: bool, tmp_path: Path) -> None:
     frames = [frame(wall(WALL_M), k, read_colour=lambda: seen) for k in range(25)]
     frames[0] = frame(wall(0.0), 0, read_colour=lambda: seen)
-    clouds, notes = prepare_clouds(frames, CloudOptions(), InProcess())
+    clouds, notes = prepare_clouds(frames, CloudOptions(), InProcess(), tmp_path)
     assert (clouds.sizes[1:] > 100).all()
     named = [note for note in notes if "colour image shows nothing" in note]
     assert len(named) == (6 if said else 0)
     assert not said or (named[0].startswith("frame 1: ") and named[-1].startswith("19 more frames: "))
 
 
-def test_no_cloud_at_all_is_an_error_with_the_first_reason() -> None:
+def test_no_cloud_at_all_is_an_error_with_the_first_reason(tmp_path: Path) -> None:
     for frames, reason in (
         ([Frame(k, 0.0, CAMERA, read_depth=unreadable) for k in range(3)], "none of the 3 frames.*truncated"),
         ([Frame(0, 0.0)], "no frame has depth with a camera, or points.*hodge inspect"),
         ([], "no frames"),
     ):
         with pytest.raises(SourceError, match=reason):
-            prepare_clouds(frames, CloudOptions(), InProcess())
+            prepare_clouds(frames, CloudOptions(), InProcess(), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -198,9 +233,7 @@ def test_a_real_frame(data_dir: Path, tmp_path: Path) -> None:
     if not path.is_dir():
         pytest.skip(f"no {path}")
     frames = SevenScenesReader().open(path).frames[:2]
-    clouds, notes = prepare_clouds(frames, CloudOptions(), InProcess())
-    clouds.save(tmp_path)
-    read = CloudSet.open(tmp_path)
+    read, notes = prepare_clouds(frames, CloudOptions(), InProcess(), tmp_path)
     assert notes == ()
     assert 8000 < read.sizes[0] < 9500
     for cloud in read:
@@ -253,6 +286,8 @@ def test_clouds_on_disk_give_their_memory_back(tmp_path: Path) -> None:
     assert resident_kb() < 1_000
     assert sum(cloud.points_in_cam.sum(dtype=float) for cloud in clouds) == pytest.approx(total)
     assert resident_kb() < whole / 2  # a system may map a file in pieces of megabytes
+    assert sum(clouds[row].points_in_cam.sum(dtype=float) for row in range(999, -1, -1)) == pytest.approx(total)
+    assert resident_kb() < whole / 2
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import tracemalloc
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -46,6 +47,17 @@ def test_proposals_are_turned_and_sorted_with_their_overlap() -> None:
     table = Edges.proposed(np.array([[2, 3], [2, 1], [0, 1]]), "overlap", np.array([0.1, 0.2, 0.3]))
     assert table.pairs.tolist() == [[0, 1], [1, 2], [2, 3]] and table.overlap.tolist() == [0.3, 0.2, 0.1]
     assert set(table.status) == {"candidate"} and np.isnan(table.i_from_j).all() and not table.counts.any()
+
+
+def test_what_is_not_known_of_proposals_takes_no_memory() -> None:
+    """Of millions of pairs that overlap some thousands are kept: motions and information take 416 bytes each."""
+    pairs = np.column_stack([np.arange(100_000), np.arange(1, 100_001)])
+    tracemalloc.start()
+    table = Edges.proposed(pairs, "overlap")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 200 * len(table)
+    np.testing.assert_array_equal(table.select(slice(3)).information, np.full((3, 6, 6), np.nan))
 
 
 def test_a_solver_gets_what_was_accepted_and_a_graph_keeps_what_is_off() -> None:

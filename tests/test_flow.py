@@ -130,7 +130,7 @@ def test_velocities_come_from_the_frames_around_and_not_from_over_a_gap() -> Non
     np.testing.assert_array_equal(velocities(poses, times, np.arange(6), found), np.zeros((6, 6)))
 
 
-def rolling_block(readout_s: float) -> tuple[PosedBlock, Floats]:
+def rolling_block(readout_s: float) -> tuple[Sightings, PosedBlock, Floats]:
     """Three frames of a camera that speeds up, the first and the last are key frames; and the true poses."""
     times = np.array([0.0, 1 / 30, 2 / 30])
     twist = np.array([0.5, 0.4, 0.3, 0.4, -0.3, 0.2])
@@ -157,32 +157,31 @@ def rolling_block(readout_s: float) -> tuple[PosedBlock, Floats]:
     start = poses.copy()
     start[1, :3, 3] += 0.02
     twists = twist * (1 + 20 * times)[:, None]
-    return PosedBlock(
-        sightings, np.arange(3), start, np.array([True, False, True]), twists, (camera,) * 3, np.zeros(3)
-    ), poses
+    block = PosedBlock(np.arange(3), start, np.array([True, False, True]), twists, (camera,) * 3, np.zeros(3))
+    return sightings, block, poses
 
 
 def test_frames_between_key_frames_are_posed_anew_at_the_shutter_of_their_camera() -> None:
     errors = []
     for readout_s in (0.0, ROLLING.readout_s):
-        block, poses = rolling_block(readout_s)
-        found = repose(block)
+        sightings, block, poses = rolling_block(readout_s)
+        found = repose(sightings, block)
         assert found.rows.tolist() == [1] and len(found.misfits) == 0
         errors.append(np.abs(found.world_from_cam[0] - poses[1]).max())
     assert errors[1] < 1e-4 < errors[0]
 
 
 def test_a_frame_that_fits_nothing_is_named() -> None:
-    block, _ = rolling_block(0.0)
-    block.sightings.seen[:80] = project(points_in_view(80, 9), CAMERA)
-    found = repose(block)
+    sightings, block, _ = rolling_block(0.0)
+    sightings.seen[:80] = project(points_in_view(80, 9), CAMERA)
+    found = repose(sightings, block)
     assert found.misfits.tolist() == [1] and len(found.rows) == 0
 
 
 def test_a_block_that_saw_nothing_is_no_error() -> None:
-    block, _ = rolling_block(0.0)
-    nothing = Sightings(*(getattr(block.sightings, field.name)[:0] for field in fields(Sightings)))
-    found = repose(replace(block, sightings=nothing, rows=block.rows[:0]))
+    sightings, block, _ = rolling_block(0.0)
+    nothing = Sightings(*(getattr(sightings, field.name)[:0] for field in fields(Sightings)))
+    found = repose(nothing, replace(block, rows=block.rows[:0]))
     assert found.rows.shape == (0,) and found.world_from_cam.shape == (0, 4, 4) and found.misfits.shape == (0,)
 
 

@@ -1,9 +1,11 @@
 """Pairs in blocks and odometry: the same on any workers, resumed or not; lost and empty frames are said."""
 
-from collections.abc import Callable
+import pickle
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,6 +93,19 @@ def test_all_workers_give_the_same_bits(folder: Path, make: Callable[[], Abstrac
     with make() as workers:
         elsewhere = register_pairs(folder, Gicp(), Edges.of(PAIRS), guesses(), workers)
     assert same_bits(here, elsewhere)
+
+
+def test_workers_are_sent_pairs_and_guesses_alone(folder: Path) -> None:
+    sent: list[int] = []
+
+    class Told(InProcess):
+        def map(self, task: Callable[[Any], Any], blocks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+            sent.extend(len(pickle.dumps(block)) for block in blocks)
+            return super().map(task, blocks)
+
+    found = register_pairs(folder, Gicp(), Edges.of(PAIRS, "overlap"), guesses(), Told())
+    assert max(sent) < 4 * 8 * (2 + 16) + 500  # a row of the table has 600 bytes and more
+    assert set(found.proposed_by) == {"overlap"} and found.counts.all()
 
 
 def test_finished_blocks_are_not_registered_again(folder: Path) -> None:

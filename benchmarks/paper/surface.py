@@ -46,7 +46,7 @@ def read_problem(run: Path, round_number: int) -> Problem:
     """The problem that a round of a finished run solved."""
     found = Run.load(run)
     solved = found.rounds[round_number]
-    graph = solved.edges.select(solved.edges.counts).as_graph(solved.vertex_ids)
+    graph = solved.edges.as_graph(solved.vertex_ids, solved.edges.counts)
     truth, clouds = true_poses(found.source)[found.key_frames.rows], found.clouds.folder
     assert clouds is not None
     return Problem(graph, found.rounds[round_number - 1].world_from_cam, truth, clouds)

@@ -13,7 +13,8 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components, first_of_component
 from hodge_pipeline.types import Bools, Floats, Ints
 
-LARGEST_BATCH = 500_000
+LARGEST_BATCH = 100_000
+"""Motions that are multiplied at once, 128 bytes each, held four times."""
 
 
 @dataclass(frozen=True)

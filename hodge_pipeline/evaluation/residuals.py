@@ -26,8 +26,8 @@ def edge_residuals(graph: ViewGraph, world_from_cam: Floats) -> tuple[Floats, Fl
 def with_residuals(edges: Edges, world_from_cam: Floats, weights: Floats) -> Edges:
     """The table with weight, residual and status of the edges of its graph, whose `weights (G,)` a solver gave them."""
     rows = np.flatnonzero(edges.in_graph)
-    graph = edges.select(rows)
-    translation_m, angle_rad = edge_residuals(graph.as_graph(np.arange(len(world_from_cam))), world_from_cam)
-    status = np.where(graph.status == DISABLED, DISABLED, np.where(weights > 0, USED, IGNORED))
+    graph = edges.as_graph(np.arange(len(world_from_cam)), rows)
+    translation_m, angle_rad = edge_residuals(graph, world_from_cam)
+    status = np.where(edges.status[rows] == DISABLED, DISABLED, np.where(weights > 0, USED, IGNORED))
     unsolved = edges.put(slice(None), weight=np.nan, residual_m=np.nan, residual_rad=np.nan)
     return unsolved.put(rows, weight=weights, residual_m=translation_m, residual_rad=angle_rad, status=status)

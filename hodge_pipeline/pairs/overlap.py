@@ -46,8 +46,8 @@ def pairwise_iou(
     others = seen[partners]
     for block in _blocks(count):
         first = int(np.searchsorted(partners, block.start)) if len(partners) == count else 0
-        common = (seen[block] @ others[first:].T).tocoo()
-        i, j = common.row + block.start, partners[common.col.astype(np.int64) + first]
+        common = (others[first:] @ seen[block].T).tocoo()  # the right side is copied
+        i, j = common.col + block.start, partners[common.row.astype(np.int64) + first]
         iou = common.data / (sizes[i] + sizes[j] - common.data)
         keep = ((i < j) | ((i > j) & ~is_partner[i])) & (iou > above)
         rows.append(np.minimum(i, j)[keep])

@@ -110,8 +110,6 @@ class _Path:
             if len(near) == 2:
                 tried_m = self._at_m[row]
                 self._try(row, near, allowed_m)
-                self._clouds.forget()
-                self._prepared.clouds.forget()
         pairs = np.array([(i, j) for i, j, _ in self._loops], np.int64).reshape(-1, 2)
         found = Edges.of(pairs, REVISIT).with_registrations([loop for _, _, loop in self._loops])
         return Edges.joined([self._known.put(slice(None), proposed_by=REVISIT), found])

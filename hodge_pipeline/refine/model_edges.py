@@ -12,6 +12,7 @@ from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.registration.clouds import CloudOptions, prepare_clouds
 from hodge_pipeline.registration.register import register_edges
 from hodge_pipeline.stages import Step, Steps, TrackedModel, Workers
+from hodge_pipeline.store.codec import CLOUDS
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, ViewGraph
 from hodge_pipeline.types.text import counted
 
@@ -67,7 +68,7 @@ def depth_clouds(
     model: TrackedModel, images: Ints, options: CloudOptions, *, workers: Workers, step: Step
 ) -> tuple[CloudSet, tuple[str, ...]]:
     """Step: the clouds of the images (D,) with depth, and notes on odd ones."""
-    return prepare_clouds([model.frames[row] for row in images], options, workers, step.advance)
+    return prepare_clouds([model.frames[row] for row in images], options, workers, step.folder / CLOUDS, step.advance)
 
 
 def held_out(count: int, share: float, seed: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

@@ -9,7 +9,7 @@ from hodge_pipeline.registration.odometry_path import contradicts_odometry, with
 from hodge_pipeline.registration.pairs import Acceptance
 from hodge_pipeline.scene import Drift
 from hodge_pipeline.types import Edges, Ints
-from hodge_pipeline.types.edges import HELD_OUT, MEASURED, REJECTED, USED
+from hodge_pipeline.types.edges import HELD_OUT, REGISTERED, REJECTED, USED
 
 CONTRADICTS = "contradicts odometry"
 
@@ -44,5 +44,5 @@ def with_odometry(edges: Edges, odometry: Edges) -> Edges:
     rows = np.array([measured[int(i), int(j)] for i, j in edges.pairs[again]], np.int64)
     lost = np.array(again, np.int64)
     worse = odometry.fitness[rows] < edges.fitness[lost] - SAME_FITNESS
-    columns = {name: getattr(odometry, name)[rows[~worse]] for name in (*MEASURED, "iterations", "converged")}
+    columns = {name: getattr(odometry, name)[rows[~worse]] for name in REGISTERED}
     return edges.put(lost, status=USED, why="").put(lost[~worse], **columns)

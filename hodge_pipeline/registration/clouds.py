@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.registration.voxel_means import voxel_means
-from hodge_pipeline.stages import Advance, Workers, no_progress
+from hodge_pipeline.stages import Advance, Workers, in_order, no_progress
 from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats32, Frame, Landmarks, PointCloud
 from hodge_pipeline.types.text import counted
 
@@ -136,9 +137,10 @@ def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCo
     return cloud, CloudCounts(samples.looked_at, valid, len(points), odd, samples.blank, no_returns)
 
 
-def landmarks_of(options: CloudOptions, frames: Sequence[Frame]) -> list[Landmarks]:
-    """The landmarks of each frame of a block."""
-    return [_landmarks(frame, options) for frame in frames]
+def landmarks_of(options: CloudOptions, frames: Sequence[Frame]) -> CloudSet:
+    """Clouds without points that have the landmarks of each frame of a block."""
+    no_points = np.zeros((0, 3), np.float32)
+    return CloudSet.from_clouds([PointCloud(no_points, landmarks=_landmarks(frame, options)) for frame in frames])
 
 
 def _landmarks(frame: Frame, options: CloudOptions) -> Landmarks:
@@ -154,24 +156,32 @@ def _landmarks(frame: Frame, options: CloudOptions) -> Landmarks:
 
 
 def prepare_clouds(
-    frames: Sequence[Frame], options: CloudOptions, workers: Workers, advance: Advance = no_progress
+    frames: Sequence[Frame], options: CloudOptions, workers: Workers, folder: Path, advance: Advance = no_progress
 ) -> tuple[CloudSet, tuple[str, ...]]:
-    """The clouds of all frames, in their order, and notes on the frames that gave none, or a cloud that is odd.
+    """The clouds of all frames, in their order, in a folder, and notes on those that gave none, or a cloud that is odd.
 
     A frame that cannot be read gets an empty cloud. Raises `SourceError` where no frame gave a single point.
     """
-    blocks = [frames[start : start + FRAMES_IN_BLOCK] for start in range(0, len(frames), FRAMES_IN_BLOCK)]
-    made: dict[int, list[tuple[PointCloud, CloudCounts]]] = {}
-    for index, result in workers.map(partial(_make_block, options=options), blocks):
-        made[index] = result
-        advance(len(result))
-    results = [one for index in range(len(blocks)) for one in made[index]]
-    odd = [counts.odd for _, counts in results if counts.odd is not None]
-    if not any(counts.points for _, counts in results):
+    every: list[CloudCounts] = []
+
+    def told(block: tuple[CloudSet, list[CloudCounts]]) -> CloudSet:
+        every.extend(block[1])
+        advance(len(block[1]))
+        return block[0]
+
+    made = workers.map(partial(_make_block, options=options), frame_blocks(frames))
+    clouds = CloudSet.write(folder, map(told, in_order(made)))
+    odd = [counts.odd for counts in every if counts.odd is not None]
+    if not any(counts.points for counts in every):
         reason = odd[0] if odd else "the source has no frames"
         raise no_clouds(frames, reason)
-    odd += [Oddity(frame.frame_id, BLANK) for frame, (_, counts) in zip(frames, results, strict=True) if counts.blank]
-    return CloudSet.from_clouds([cloud for cloud, _ in results]), shortened(odd) + _no_returns(results)
+    odd += [Oddity(frame.frame_id, BLANK) for frame, counts in zip(frames, every, strict=True) if counts.blank]
+    return clouds, shortened(odd) + _no_returns(every)
+
+
+def frame_blocks(frames: Sequence[Frame]) -> list[Sequence[Frame]]:
+    """The frames in blocks for workers."""
+    return [frames[start : start + FRAMES_IN_BLOCK] for start in range(0, len(frames), FRAMES_IN_BLOCK)]
 
 
 def no_clouds(frames: Sequence[Frame], first: object) -> SourceError:
@@ -187,12 +197,12 @@ def no_clouds(frames: Sequence[Frame], first: object) -> SourceError:
     )
 
 
-def _no_returns(results: Sequence[tuple[PointCloud, CloudCounts]]) -> tuple[str, ...]:
+def _no_returns(every: Sequence[CloudCounts]) -> tuple[str, ...]:
     """The note that counts the points of scans that are no returns, where there are any."""
-    lost = sum(counts.no_returns for _, counts in results)
+    lost = sum(counts.no_returns for counts in every)
     if not lost:
         return ()
-    looked_at = sum(counts.looked_at for _, counts in results)
+    looked_at = sum(counts.looked_at for counts in every)
     return (f"{lost} of {looked_at} points ({lost / looked_at:.1%}) are no returns (zero, or no number): left out",)
 
 
@@ -219,8 +229,9 @@ def shortened(odd: Sequence[Oddity]) -> tuple[str, ...]:
     return tuple(str(one) for same in alike.values() for one in same[:LISTED_NOTES]) + more
 
 
-def _make_block(frames: Sequence[Frame], options: CloudOptions) -> list[tuple[PointCloud, CloudCounts]]:
-    return [_make_or_report(frame, options) for frame in frames]
+def _make_block(frames: Sequence[Frame], options: CloudOptions) -> tuple[CloudSet, list[CloudCounts]]:
+    made = [_make_or_report(frame, options) for frame in frames]
+    return CloudSet.from_clouds([cloud for cloud, _ in made]), [counts for _, counts in made]
 
 
 def cloud_or_note(frame: Frame, options: CloudOptions) -> tuple[PointCloud, str]:

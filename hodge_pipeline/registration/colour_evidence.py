@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -9,6 +11,8 @@ from hodge_pipeline import se3
 from hodge_pipeline.types import Bytes, CloudSet, Floats, Ints, PointCloud
 
 POINTS_COMPARED = 800
+SURFACES_KEPT = 64
+"""Trees in memory, 0.1 to 1 MB each; pairs come sorted by their first cloud."""
 FEWEST_COMPARED = 100
 NEAR_SPACINGS = 1.5
 """Points of two clouds within so many times the distance between neighbours are of one surface."""
@@ -20,14 +24,12 @@ OTHER_HUE = 0.4
 
 def hue_conflicts(clouds: CloudSet, pairs: Ints, i_from_j: Floats) -> Floats:
     """The share (P,) of common surface points whose hue differs; NaN without colours or with little in common."""
-    surfaces: dict[int, tuple[cKDTree, float]] = {}
+    surface_of = lru_cache(maxsize=SURFACES_KEPT)(lambda row: _surface(clouds[row]))
     out = np.full(len(pairs), np.nan)
-    if not clouds.colours.any():
+    if not any(cloud.colours is not None and cloud.colours.any() for cloud in clouds):
         return out
     for at, ((i, j), motion) in enumerate(zip(pairs.tolist(), i_from_j, strict=True)):
-        if i not in surfaces:
-            surfaces[i] = _surface(clouds[i])
-        tree, within_m = surfaces[i]
+        tree, within_m = surface_of(i)
         source = clouds[j]
         step = max(1, len(source) // POINTS_COMPARED)
         moved = se3.transform(motion, np.asarray(source.points_in_cam[::step], float))

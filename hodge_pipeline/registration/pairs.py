@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
+from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, cast
@@ -16,7 +17,8 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline import se3
 from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
-from hodge_pipeline.types import Bools, CloudSet, Edges, Floats
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints
+from hodge_pipeline.types.edges import REGISTERED, USED
 
 PAIRS_IN_BLOCK = 64
 """About half a second: long against sending a block, short enough to share the work and to lose little of it."""
@@ -119,28 +121,28 @@ def register_pairs(
     earlier run can be given; `on_block` is called with each new one, to be kept. `advance` counts pairs.
     """
     order = np.lexsort((edges.pairs[:, 1], edges.pairs[:, 0]))
-    cuts = [order[start : start + PAIRS_IN_BLOCK] for start in range(0, len(order), PAIRS_IN_BLOCK)]
+    pairs, guesses = edges.pairs[order], guesses[order]
+    cuts = [slice(start, start + PAIRS_IN_BLOCK) for start in range(0, len(order), PAIRS_IN_BLOCK)]
     results = dict(finished or {})
-    advance(sum(len(cuts[block]) for block in results))
+    advance(sum(map(len, results.values())))
     missing = [block for block in range(len(cuts)) if block not in results]
     task = partial(_register_block, folder, registrar)
-    for row, result in workers.map(task, [(edges.select(cuts[block]), guesses[cuts[block]]) for block in missing]):
+    for row, result in workers.map(task, [(pairs[cuts[block]], guesses[cuts[block]]) for block in missing]):
         block = missing[row]
         results[block] = result
         on_block(block, result)
-        advance(len(cuts[block]))
-    in_blocks = Edges.joined([results[block] for block in range(len(cuts))])
-    return in_blocks.select(np.argsort(order))
+        advance(len(result))
+    found = Edges.joined([results.pop(block) for block in range(len(cuts))]).select(np.argsort(order))
+    columns = {name: getattr(found, name) for name in REGISTERED}
+    return replace(edges, status=np.full(len(edges), USED), **columns)
 
 
 @plugin_errors()
-def _register_block(folder: Path, registrar: Registrar, block: tuple[Edges, Floats]) -> Edges:
-    edges, guesses = block
-    prepared = prepared_clouds(folder, registrar)
-    pairs = zip(edges.pairs, guesses, strict=True)
-    found = [registrar.register(prepared[i], prepared[j], guess) for (i, j), guess in pairs]
-    prepared.clouds.forget()
-    return edges.with_registrations(found)
+def _register_block(folder: Path, registrar: Registrar, block: tuple[Ints, Floats]) -> Edges:
+    prepared, pairs = prepared_clouds(folder, registrar), block[0]
+    found = [registrar.register(prepared[i], prepared[j], guess) for (i, j), guess in zip(*block, strict=True)]
+    prepared.clouds.forget()  # they stay open for the next block
+    return Edges.of(pairs).with_registrations(found)
 
 
 def prepared_clouds(folder: Path, registrar: Registrar) -> PreparedClouds:

@@ -14,7 +14,7 @@ from hodge_pipeline.registration.pairs import HELD_SPREADS, held_where_sliding, 
 from hodge_pipeline.stages import Registrar, Step, Workers
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints
-from hodge_pipeline.types.edges import HELD_OUT, MEASURED, USED
+from hodge_pipeline.types.edges import HELD_OUT, REGISTERED, USED
 
 REUSE_WITHIN_M = 0.01
 """Between a registration and where the poses now put its pair: nearer than any registrar's start must be."""
@@ -59,7 +59,7 @@ def register_edges(
     found = held_where_sliding(found, guesses[missing], min_spread)
     kept = candidates.select(rows)
     if earlier is not None and len(rows):
-        columns = {name: getattr(earlier, name)[known] for name in (*MEASURED, "iterations", "converged")}
+        columns = {name: getattr(earlier, name)[known] for name in REGISTERED}
         kept = replace(kept, status=np.full(len(rows), USED), **columns)
     order = np.argsort(np.concatenate([missing, rows]))
     return Edges.joined([Edges.joined([found, kept]).select(order), edges.select(held_out)])

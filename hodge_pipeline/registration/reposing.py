@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.registration.resection import back_project, project, resect
 from hodge_pipeline.registration.shutter import at_frame_stamp
 from hodge_pipeline.registration.sightings import Sightings
+from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Bools, Camera, Floats, Ints
 
 FEWEST_POINTS = 20
@@ -18,12 +20,11 @@ FEWEST_POINTS = 20
 
 @dataclass(frozen=True)
 class PosedBlock:
-    """Sightings and, of their frames and key frames `rows (R,)`, what is known so far: poses (R, 4, 4), whether each
+    """What is known so far of the frames and key frames `rows (R,)` of some sightings: poses (R, 4, 4), whether each
     `is_key (R,)`, velocities (R, 6), the cameras, by how many seconds colour is later than depth
     (R,), and the metre in the unit of these lengths.
     """
 
-    sightings: Sightings
     rows: Ints
     world_from_cam: Floats
     is_key: Bools
@@ -45,11 +46,16 @@ class Reposed:
     misfits: Ints
 
 
-def repose(block: PosedBlock) -> Reposed:
+def repose_stored(block: tuple[Path, PosedBlock]) -> Reposed:
+    """The frames of a block, posed anew by the sightings in a file."""
+    return repose(artifacts.load(block[0], Sightings), block[1])
+
+
+def repose(sightings: Sightings, block: PosedBlock) -> Reposed:
     """The frames of a block, posed anew; key frames stay where the solve has put them."""
-    sightings, at = block.sightings, {int(row): place for place, row in enumerate(block.rows)}
-    seen = _at_stamps(block, at)
-    corners = _solved_corners(block, at, seen)
+    at = {int(row): place for place, row in enumerate(block.rows)}
+    seen = _at_stamps(sightings, block, at)
+    corners = _solved_corners(sightings, block, at, seen)
     rows, poses, information, misfits = [], [], [], []
     for row, own in groups(sightings.frame):
         place = at[row]
@@ -76,9 +82,9 @@ def groups(labels: Ints) -> list[tuple[int, Ints]]:
     return list(zip(values.tolist(), np.split(order, begin[1:]), strict=True))
 
 
-def _at_stamps(block: PosedBlock, at: dict[int, int]) -> Floats:
+def _at_stamps(sightings: Sightings, block: PosedBlock, at: dict[int, int]) -> Floats:
     """Columns u, v, z (S, 3) of all sightings as they would be at the stamps of their frames."""
-    sightings, out = block.sightings, block.sightings.seen.copy()
+    out = sightings.seen.copy()
     world_from_key = block.world_from_cam[[at[int(row)] for row in sightings.key]]
     corners_in_world = np.einsum("nij,nj->ni", world_from_key[:, :3, :3], sightings.points) + world_from_key[:, :3, 3]
     for row, own in groups(sightings.frame):
@@ -98,9 +104,8 @@ def seen_at_stamp(seen: Floats, expected_z: Floats, camera: Camera, colour_delay
     return moved
 
 
-def _solved_corners(block: PosedBlock, at: dict[int, int], seen: Floats) -> Floats:
+def _solved_corners(sightings: Sightings, block: PosedBlock, at: dict[int, int], seen: Floats) -> Floats:
     """Corners (C, 3) in the world: the mean of what their own key frame and the others that saw them measured."""
-    sightings = block.sightings
     total, count = np.zeros((len(sightings.key), 3)), np.ones(len(sightings.key))
     for row, own in groups(sightings.key):
         place = at[row]

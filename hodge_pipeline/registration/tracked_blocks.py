@@ -5,10 +5,8 @@ from __future__ import annotations
 import shutil
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hodge_pipeline.registration.sightings import Sightings
 from hodge_pipeline.store import artifacts
@@ -89,48 +87,17 @@ class TrackedBlocks:
         """Forget the blocks: what they held is written."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
-    def join_clouds(self, folder: Path) -> None:
-        """Write the clouds of the key frames of all blocks as a `CloudSet` into a folder.
-
-        Memory holds the clouds of one block at a time.
-        """
-        sizes, marks = [np.zeros(1, np.int64)], [np.zeros(1, np.int64)]
-        paths = sorted(self._folder.glob("[0-9]*.npz"))
-        for path in paths:
-            with np.load(path) as stored:
-                sizes.append(np.diff(stored[CLOUD + "offsets"]))
-                marks.append(np.diff(stored[CLOUD + "marks"]))
-        ends = {"offsets": np.cumsum(np.concatenate(sizes)), "marks": np.cumsum(np.concatenate(marks))}
-        nothing = CloudSet.from_clouds([])
-        files: dict[str, NDArray[Any]] = {}
-        for name in CloudSet.FILES:
-            if name in ends:
-                np.save(folder / f"{name}.npy", ends[name])
-                continue
-            like: NDArray[Any] = getattr(nothing, name)
-            shape = (int(ends["marks" if name.startswith("mark_") else "offsets"][-1]), *like.shape[1:])
-            files[name] = _empty_file(folder / f"{name}.npy", shape, like.dtype)
-        filled = dict.fromkeys(files, 0)
-        for path in paths:
-            with np.load(path) as stored:
-                for name, file in files.items():
-                    column = stored[CLOUD + name]
-                    file[filled[name] : filled[name] + len(column)] = column
-                    filled[name] += len(column)
+    def join_clouds(self, folder: Path) -> CloudSet:
+        """The clouds of the key frames of all blocks, written into a folder."""
+        return CloudSet.write(folder, map(_clouds, sorted(self._folder.glob("[0-9]*.npz"))))
 
     def _path(self, number: int) -> Path:
         return self._folder / f"{number:06d}.npz"
 
 
-def _empty_file(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """An array to be filled that is the file; an empty array cannot be mapped, and is written as it is."""
-    if shape[0]:
-        mapped: NDArray[Any] = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
-        with path.open("ab") as file:
-            artifacts.reserve(file, path.stat().st_size)
-        return mapped
-    np.save(path, np.zeros(shape, dtype))
-    return np.zeros(shape, dtype)
+def _clouds(path: Path) -> CloudSet:
+    with np.load(path) as stored:
+        return CloudSet(*(stored[CLOUD + name] for name in CloudSet.FILES))
 
 
 def _is_whole(path: Path) -> bool:

@@ -8,13 +8,11 @@ import numpy as np
 
 from hodge_pipeline.complex.components import in_runs
 from hodge_pipeline.registration.readout import with_readout
-from hodge_pipeline.registration.reposing import PosedBlock, repose
+from hodge_pipeline.registration.reposing import PosedBlock, repose_stored
 from hodge_pipeline.registration.shutter import LONGEST_SPAN_S, velocities
-from hodge_pipeline.registration.sightings import Sightings
 from hodge_pipeline.registration.smoothing import VIDEO_STEP_S, smoothed
 from hodge_pipeline.scene import KeyFrames, Scene, stamps_of, vertex_ids
 from hodge_pipeline.stages import Step, Steps, Workers
-from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Floats, Source
 from hodge_pipeline.types.notes import Note
 
@@ -49,16 +47,16 @@ def pose_frames(
     poses, information, misfits = world_from_cam.copy(), np.zeros((len(world_from_cam), 6, 6)), list[int]()
 
     def block(path: Path) -> PosedBlock:
-        own = artifacts.load(path, Sightings)
-        rows = np.union1d(own.key, own.frame)
+        with np.load(path) as own:
+            rows = np.union1d(own["key"], own["frame"])
         frames = [source.frames[row] for row in rows]
         readout_s = key_frames.readout_s
         cameras = tuple(with_readout(frame.camera, readout_s) for frame in frames if frame.camera is not None)
         delays_s = np.array([frame.colour_delay_s for frame in frames])
-        return PosedBlock(own, rows, world_from_cam[rows], is_key[rows], twists[rows], cameras, delays_s, unit_m)
+        return PosedBlock(rows, world_from_cam[rows], is_key[rows], twists[rows], cameras, delays_s, unit_m)
 
     paths = sorted(sightings.glob("*.npz"))
-    for _, found in workers.map(repose, [block(path) for path in paths]):
+    for _, found in workers.map(repose_stored, [(path, block(path)) for path in paths]):
         poses[found.rows] = found.world_from_cam
         information[found.rows] = found.information
         misfits.extend(found.misfits.tolist())

@@ -38,14 +38,14 @@ def edited_rounds(work: Work, folder: Path, rounds: Sequence[Round]) -> Iterator
     ids, registered, before = last.vertex_ids, last.registered(work.measured), last.world_from_cam
     edges, fresh = _edited(work, registered, history), np.zeros(0, np.int64)
     if history.registered:
-        placed = _placed(work, edges.select(edges.counts).as_graph(ids))
+        placed = _placed(work, edges.as_graph(ids, edges.counts))
         before, pairs = placed.world_from_cam, vertex_rows(ids, history.registered)
         guesses = np.array([history.guesses.get(pair, UNKNOWN) for pair in history.registered])
         new = register_more(work, "registration, by hand", BY_HAND, pairs, placed, guesses)
         edges = _edited(work, Edges.joined([registered, new]), history)
         fresh = np.arange(len(registered), len(registered) + len(new))
     _tell(work, edges.select(edges.status != HELD_OUT), ids, history)
-    start = _start(work, edges.select(edges.counts).as_graph(ids), rounds)
+    start = _start(work, edges.as_graph(ids, edges.counts), rounds)
     yield Registered(EDITED, edges, fresh, before, start, edges.counts & _any_joining(edges, ids, history.right))
 
 

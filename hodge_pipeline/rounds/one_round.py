@@ -52,7 +52,7 @@ class Registered:
 
     def graph(self, vertex_ids: NDArray[np.generic]) -> ViewGraph:
         """The viewing graph of the edges that count."""
-        return self.edges.select(self.edges.counts).as_graph(vertex_ids)
+        return self.edges.as_graph(vertex_ids, self.edges.counts)
 
     def solved(self, solve_with: SolveWith) -> Bools:
         """The rows to solve with: all that count, or of these what the diagnosis keeps or a person calls right."""
@@ -216,7 +216,7 @@ def solve_edges(
     `up (3,)` being what points up; `found` of ω at its start is kept.
     """
     edges, solved = registered.edges, registered.solved(solve_with)
-    graph = edges.select(solved).as_graph(vertex_ids)
+    graph = edges.as_graph(vertex_ids, solved)
     solution = solver.solve(graph, registered.start)
     if registered.right is not None:
         solution = with_right(graph, solution, registered.right[solved])
@@ -252,4 +252,4 @@ def with_right(graph: ViewGraph, solution: Solution, right: Bools) -> Solution:
 def judge_edges(edges: Edges, vertex_ids: NDArray[np.generic], options: DiagnosisOptions, *, step: Step) -> Edges:
     """Step: the table with the verdict of the diagnosis on each edge of its graph, those off by hand included."""
     unjudged = edges.put(slice(None), verdict="", probability=np.nan, leverage=np.nan)
-    return diagnose(edges.select(edges.in_graph).as_graph(vertex_ids), options).put_into(unjudged)
+    return diagnose(edges.as_graph(vertex_ids, edges.in_graph), options).put_into(unjudged)

@@ -95,7 +95,7 @@ def _judged(work: Work, last: Round, edges: Edges, rows: Ints, suggested: Sugges
     across = suggested.placed.across(new.pairs)
     if not across.any():
         return edges, last.world_from_cam
-    graph = ViewGraph.joined([last.graph, new.select(new.counts).as_graph(last.vertex_ids)])
+    graph = ViewGraph.joined([last.graph, new.as_graph(last.vertex_ids, new.counts)])
     found = diagnose(graph, work.recipe.diagnosis)
     dropped = rows[new.counts][~found.kept[last.graph.edge_count :] & across[new.counts]]
     edges = edges.put(dropped, status=REJECTED, why="the diagnosis of all edges does not keep it")

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-from hodge_pipeline.registration.clouds import FRAMES_IN_BLOCK, CloudOptions, landmarks_of, prepare_clouds
-from hodge_pipeline.stages import Step, Steps, Workers
+from hodge_pipeline.registration.clouds import CloudOptions, frame_blocks, landmarks_of, prepare_clouds
+from hodge_pipeline.stages import Step, Steps, Workers, in_order
 from hodge_pipeline.start.unordered.options import GlobalStart
-from hodge_pipeline.types import CloudSet, Landmarks, Source
+from hodge_pipeline.store import artifacts
+from hodge_pipeline.store.codec import CLOUDS
+from hodge_pipeline.types import CloudSet, Source
 from hodge_pipeline.types.notes import notes_of
 
 
@@ -19,7 +21,7 @@ def make_clouds(source: Source, options: CloudOptions, steps: Steps, workers: Wo
 
 def clouds(source: Source, options: CloudOptions, *, workers: Workers, step: Step) -> CloudSet:
     """Step: the cloud of each frame by `registration.clouds`."""
-    made, notes = prepare_clouds(source.frames, options, workers, step.advance)
+    made, notes = prepare_clouds(source.frames, options, workers, step.folder / CLOUDS, step.advance)
     step.note(*notes_of("clouds", notes))
     return made
 
@@ -38,13 +40,18 @@ def with_landmarks(
 
 
 def add_landmarks(source: Source, made: CloudSet, options: CloudOptions, *, workers: Workers, step: Step) -> CloudSet:
-    """Step: the clouds with landmarks of the frames (N) that they are of."""
-    frames, found = source.frames, dict[int, list[Landmarks]]()
-    blocks = [frames[start : start + FRAMES_IN_BLOCK] for start in range(0, len(frames), FRAMES_IN_BLOCK)]
-    for index, landmarks in workers.map(partial(landmarks_of, options), blocks):
-        found[index] = landmarks
-        step.advance(len(landmarks))
-    return made.with_landmarks([one for index in range(len(blocks)) for one in found[index]])
+    """Step: the clouds with landmarks of the frames (N) that they are of; their points are the files of before."""
+
+    def told(block: CloudSet) -> CloudSet:
+        step.advance(len(block))
+        return block
+
+    assert made.folder is not None
+    folder, found = step.folder / CLOUDS, workers.map(partial(landmarks_of, options), frame_blocks(source.frames))
+    CloudSet.write(folder, map(told, in_order(found)))
+    for name in CloudSet.OF_POINTS:
+        artifacts.link_or_copy(made.folder / f"{name}.npy", folder / f"{name}.npy")
+    return CloudSet.open(folder)
 
 
 def landmarks_for(clouds: CloudOptions, matching: GlobalStart) -> CloudOptions:

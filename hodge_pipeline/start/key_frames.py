@@ -33,6 +33,7 @@ from hodge_pipeline.scene import (
 )
 from hodge_pipeline.stages import Advance, Step, Steps, Workers
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
+from hodge_pipeline.store.codec import CLOUDS
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Source
 from hodge_pipeline.types.notes import Note, notes_of
 from hodge_pipeline.types.text import counted
@@ -155,10 +156,8 @@ def track(source: Source, options: TrackingOptions, *, workers: Workers, step: S
     blocks = TrackedBlocks(folder / "blocks")
     _track_missing(blocks, cut, options, workers, step.advance)
     parts = [blocks.rows(number) for number in range(len(cut))]
-    clouds = folder / "clouds"
-    clouds.mkdir(exist_ok=True)
-    blocks.join_clouds(clouds)
-    if not CloudSet.open(clouds).sizes.any():
+    clouds = blocks.join_clouds(folder / CLOUDS)
+    if not clouds.sizes.any():
         reason = next((note for part in parts for note in part.notes), "no frame has depth")
         raise no_clouds(source.frames, reason)
     key_rows = np.concatenate([part.keys for part in parts])
@@ -166,13 +165,13 @@ def track(source: Source, options: TrackingOptions, *, workers: Workers, step: S
     edges = Edges.joined([part.steps for part in parts])
     edges = replace(edges, pairs=_renumbered(edges.pairs, key_of_row))
     key_sequences = [np.flatnonzero(np.isin(key_rows, rows)) for rows in sequences]
-    poses = chained(len(key_rows), key_sequences, edges, REACHES_APART * CloudSet.open(clouds).reach_m)
-    held, poses = bridge(clouds, key_sequences, edges, poses, options.odometry, workers)
+    poses = chained(len(key_rows), key_sequences, edges, REACHES_APART * clouds.reach_m)
+    held, poses = bridge(folder / CLOUDS, key_sequences, edges, poses, options.odometry, workers)
     sightings = folder / "sightings"
     sightings.mkdir(exist_ok=True)
     blocks.keep_sightings(sightings)
     tracked = Tracked(
-        clouds=CloudSet.open(clouds),
+        clouds=clouds,
         sightings=sightings,
         key_rows=key_rows,
         world_from_key=poses,

@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,15 +18,6 @@ from hodge_pipeline.types.input_files import open_input, read_input_text
 from hodge_pipeline.types.output_files import draft_of, replacing
 
 T = TypeVar("T")
-
-
-def reserve(file: IO[bytes], size: int) -> None:
-    """Room for so many bytes, before the file is mapped: on a full disk, writing to a mapped page kills the process.
-
-    Raises `OSError`.
-    """
-    if size and hasattr(os, "posix_fallocate"):
-        os.posix_fallocate(file.fileno(), 0, size)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -55,9 +55,9 @@ def _plain(folder: Path, value: Any, place: str, arrays: dict[str, NDArray[Any]]
         arrays[place or "bytes"] = np.frombuffer(value, np.uint8)
         return {"bytes": place or "bytes"}
     if isinstance(value, CloudSet):
-        own = folder / (place or CLOUDS)
-        if value.folder is None or value.folder != own:
-            own.mkdir(exist_ok=True)
+        own = value.folder
+        if own is None or own.parent != folder:
+            own = folder / (place or CLOUDS)
             value.save(own)
         return {"clouds": own.name}
     if isinstance(value, Path):

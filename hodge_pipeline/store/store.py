@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import shutil
+import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache, partial
@@ -65,7 +66,7 @@ class Store:
         self.folder, self.notes = folder, list[Note]()
         self.watcher = watcher or Nobody()
         self._monitor, self._counts = Monitor(), Counter[str]()
-        self._keys: dict[int, tuple[object, str]] = {}
+        self._keys: dict[int, tuple[Callable[[], object], str]] = {}
         self._index: list[dict[str, Any]] = []
 
     def step(
@@ -89,12 +90,12 @@ class Store:
     def key(self, value: Any) -> str:
         """The key of an input: of the step that made it, else of its contents."""
         known = self._keys.get(id(value))
-        return known[1] if known is not None and known[0] is value else _hash(self._content(value))
+        return known[1] if known is not None and known[0]() is value else _hash(self._content(value))
 
     def remember(self, value: object, key: str) -> None:
-        """Let `value`, this very object, stand for `key` wherever it is an input."""
+        """Let `value`, this very object, stand for `key` wherever it is an input, as long as somebody holds it."""
         if value is not None and not isinstance(value, (bool, int, float, str)):
-            self._keys[id(value)] = (value, key)
+            self._keys[id(value)] = (_reference(value), key)
 
     def note(self, *notes: Note) -> None:
         """Tell the user, the log and the report, once; a finished step tells its notes again in every later run."""
@@ -175,7 +176,8 @@ class Store:
 
     def _give_back_memory(self, was_long: bool) -> None:
         """Of what a step has read of clouds and has freed, which the next one would be charged with."""
-        for value, _ in self._keys.values():
+        for reference, _ in self._keys.values():
+            value = reference()
             if isinstance(value, CloudSet):
                 value.forget()
         give_back_memory(cycles=was_long)
@@ -298,6 +300,14 @@ def _text(path: Path) -> str:
 
 def _hash(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=_number).encode()).hexdigest()[:32]
+
+
+def _reference(value: T) -> Callable[[], T | None]:
+    """What gives the value as long as somebody else holds it; for ever where its type allows no weak references."""
+    try:
+        return weakref.ref(value)
+    except TypeError:
+        return lambda: value
 
 
 def _number(value: Any) -> Any:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import mmap
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from types import TracebackType
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hodge_pipeline.types.arrays import Bytes, Floats32, Ints
 
-CLOUDS_AT_ONCE = 256
-"""Read one after another before their memory is given back: 15 to 60 MB."""
+CLOUDS_AT_ONCE = 64
+"""Read before their memory is given back: 4 to 15 MB."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,8 @@ class CloudSet(Sequence[PointCloud]):
     in memory.
     """
 
-    FILES = ("offsets", "points", "normals", "colours", "marks", "mark_points", "mark_descriptors", "mark_pixel_rad")
+    OF_POINTS = ("offsets", "points", "normals", "colours")
+    FILES = (*OF_POINTS, "marks", "mark_points", "mark_descriptors", "mark_pixel_rad")
 
     def __init__(
         self,
@@ -81,7 +84,7 @@ class CloudSet(Sequence[PointCloud]):
         mark_pixel_rad: Floats32,
         folder: Path | None = None,
     ) -> None:
-        self.folder = folder
+        self.folder, self._reads = folder, 0
         self.offsets, self.points, self.normals, self.colours = offsets, points, normals, colours
         self.marks, self.mark_points, self.mark_descriptors = marks, mark_points, mark_descriptors
         self.mark_pixel_rad = mark_pixel_rad
@@ -91,12 +94,21 @@ class CloudSet(Sequence[PointCloud]):
         """The clouds that `save` wrote to this folder, mapped read-only."""
         return cls(**{name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in cls.FILES}, folder=folder)
 
-    def with_landmarks(self, landmarks: Sequence[Landmarks]) -> CloudSet:
-        """The same clouds with these landmarks (N)."""
-        of_none = PointCloud(np.zeros((0, 3), np.float32))
-        marks = CloudSet.from_clouds([replace(of_none, landmarks=one) for one in landmarks])
-        of_marks = (marks.marks, marks.mark_points, marks.mark_descriptors, marks.mark_pixel_rad)
-        return CloudSet(self.offsets, self.points, self.normals, self.colours, *of_marks)
+    @classmethod
+    def write(cls, folder: Path, parts: Iterable[CloudSet]) -> CloudSet:
+        """The clouds of all parts as one set, written into a folder part by part and opened there."""
+        folder.mkdir(exist_ok=True)
+        nothing = cls.from_clouds([])
+        with ExitStack() as stack:
+            files = {
+                name: stack.enter_context(_Column(folder / f"{name}.npy", getattr(nothing, name))) for name in cls.FILES
+            }
+            for part in parts:
+                begin = {"offsets": files["points"].rows, "marks": files["mark_points"].rows}
+                for name, file in files.items():
+                    column = getattr(part, name)
+                    file.append(column[1:] + begin[name] if name in begin else column)
+        return cls.open(folder)
 
     @classmethod
     def from_clouds(cls, clouds: Sequence[PointCloud]) -> CloudSet:
@@ -117,11 +129,8 @@ class CloudSet(Sequence[PointCloud]):
         )
 
     def save(self, folder: Path) -> None:
-        """Write the columns into a folder that exists, one `.npy` each."""
-        for name in self.FILES:
-            with (folder / f"{name}.npy").open("wb") as file:
-                # Not numpy's own writing to files: on a disk that fills up its last bytes are lost without an error.
-                np.save(cast(Any, SimpleNamespace(write=file.write)), getattr(self, name))
+        """Write the columns into a folder, one `.npy` each."""
+        CloudSet.write(folder, [self])
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
@@ -130,24 +139,21 @@ class CloudSet(Sequence[PointCloud]):
         return f"CloudSet({len(self)} clouds, {int(self.offsets[-1])} points)"
 
     def __getitem__(self, row: int) -> PointCloud:  # type: ignore[override]
-        """The cloud of one frame (a view, not a copy)."""
+        """The cloud of one frame (a view, not a copy); the memory of those read before is given back now and then."""
         if not -len(self) <= row < len(self):
             raise IndexError(row)
+        self._reads += 1
+        if self._reads % CLOUDS_AT_ONCE == 0:
+            self.forget()
         row %= len(self)
         cut = slice(int(self.offsets[row]), int(self.offsets[row + 1]))
         own = slice(int(self.marks[row]), int(self.marks[row + 1]))
         landmarks = Landmarks(self.mark_points[own], self.mark_descriptors[own], self.mark_pixel_rad[own])
         return PointCloud(self.points[cut], self.normals[cut], self.colours[cut], landmarks)
 
-    def __iter__(self) -> Iterator[PointCloud]:
-        return self.read(range(len(self)))
-
     def read(self, rows: Iterable[int]) -> Iterator[PointCloud]:
-        """The clouds of these rows one after another; the memory of those before is given back."""
-        for number, row in enumerate(rows, start=1):
-            yield self[row]
-            if number % CLOUDS_AT_ONCE == 0:
-                self.forget()
+        """The clouds of these rows one after another."""
+        return map(self.__getitem__, rows)
 
     def forget(self) -> None:
         """Give back the memory of what was read of the files; it is read again when it is needed."""
@@ -165,6 +171,39 @@ class CloudSet(Sequence[PointCloud]):
     def reach_m(self) -> float:
         """How far the farthest point of any cloud is from its camera; 1 where there is none."""
         return max((float(np.linalg.norm(c.points_in_cam, axis=1).max()) for c in self if len(c)), default=0.0) or 1.0
+
+
+class _Column:
+    """An array in a `.npy` file that begins with `first` and grows: a context that ends with its header."""
+
+    def __init__(self, path: Path, first: NDArray[Any]) -> None:
+        path.unlink(missing_ok=True)  # it may be another name of a file that is kept
+        self._file, self._first, self.rows = path.open("wb"), first, 0
+
+    def __enter__(self) -> _Column:
+        self._write_header()
+        self.append(self._first)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._file:
+            if error is None:
+                self._write_header()
+
+    def append(self, rows: NDArray[Any]) -> None:
+        # Not numpy's own writing to files: on a disk that fills up its last bytes are lost without an error.
+        self._file.write(np.ascontiguousarray(rows, self._first.dtype).data)
+        self.rows += len(rows)
+
+    def _write_header(self) -> None:
+        """As long for any number of rows: numpy leaves room for it to grow."""
+        shape = (self.rows, *self._first.shape[1:])
+        self._file.seek(0)
+        np.lib.format.write_array_header_1_0(
+            self._file, {**np.lib.format.header_data_from_array_1_0(self._first), "shape": shape}
+        )
 
 
 def _offsets(sizes: Sequence[int]) -> Ints:

@@ -186,12 +186,13 @@ class Edges:
         pairs = np.asarray(pairs, np.int64).reshape(-1, 2)
         count = len(pairs)
         number, word, whole = np.full(count, np.nan), np.full(count, ""), np.zeros(count, np.int64)
+        nothing = np.array(np.nan)  # seen in every element, which takes no memory
         return cls(
             pairs=pairs,
             proposed_by=np.full(count, proposed_by),
             overlap=number,
-            i_from_j=np.full((count, 4, 4), np.nan),
-            information=np.full((count, 6, 6), np.nan),
+            i_from_j=np.broadcast_to(nothing, (count, 4, 4)),
+            information=np.broadcast_to(nothing, (count, 6, 6)),
             fitness=number,
             rmse_m=number,
             correspondences=whole,
@@ -274,11 +275,14 @@ class Edges:
         reasons, counts = np.unique(self.why[self.status == REJECTED], return_counts=True)
         return dict(zip(reasons.tolist(), counts.tolist(), strict=True))
 
-    def as_graph(self, vertex_ids: ArrayLike) -> ViewGraph:
-        """The viewing graph of all rows, each of which has a motion: `select` first."""
-        columns = {name: getattr(self, name) for name in MEASURED}
-        return ViewGraph(vertex_ids=np.asarray(vertex_ids), edges=self.pairs, source=self.proposed_by, **columns)
+    def as_graph(self, vertex_ids: ArrayLike, rows: Ints | Bools | slice = slice(None)) -> ViewGraph:
+        """The viewing graph of these rows, each of which has a motion."""
+        columns = {name: getattr(self, name)[rows] for name in MEASURED}
+        pairs, source = self.pairs[rows], self.proposed_by[rows]
+        return ViewGraph(vertex_ids=np.asarray(vertex_ids), edges=pairs, source=source, **columns)
 
 
 MEASURED = ("i_from_j", "information", "fitness", "rmse_m", "correspondences")
 """The columns that `Edges` and `ViewGraph` have in common."""
+REGISTERED = (*MEASURED, "iterations", "converged")
+"""The columns of what a registrar finds."""

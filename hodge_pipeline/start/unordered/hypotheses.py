@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints
 from hodge_pipeline.types.edges import REJECTED, USED
 
 POINTS_PROJECTED = 1500
+POINTS_KEPT = 256
+"""Clouds whose points are in memory, 36 kB each."""
 LEAD_SIGMAS = 2.0
 """Of the Poisson noise of a count: how far a motion's matches must exceed those of the best other motion."""
 ANOTHER_M, ANOTHER_RAD = 0.3, np.radians(10.0)
@@ -175,12 +178,12 @@ def _allowed(shares: Floats, least: float) -> float:
 
 def violations(clouds: CloudSet, pairs: Ints, i_from_j: Floats, view_of: ViewOf, scale: float = 1.0) -> Floats:
     """The free-space violation (P,) of each pair, NaN where a frame has no depth image."""
-    points = {row: _sampled(clouds, row) for row in np.unique(pairs).tolist()}
+    points_of = lru_cache(maxsize=POINTS_KEPT)(partial(_sampled, clouds))
     out = np.full(len(pairs), np.nan)
     for at, ((i, j), motion) in enumerate(zip(pairs.tolist(), i_from_j, strict=True)):
         first, second = view_of(i), view_of(j)
         if first is not None and second is not None:
-            out[at] = violation((first, second), (points[i], points[j]), motion, scale)
+            out[at] = violation((first, second), (points_of(i), points_of(j)), motion, scale)
     return out
 
 

@@ -67,7 +67,7 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     notes = [] if by_image or scene.given is not None else [*check_scans(clouds, scene.vertex_ids)]
     hypotheses, views = weighed_matches(scene, np.flatnonzero(clouds.sizes > 0), options, scratch, workers, advance)
     notes.append(tried(int((clouds.sizes > 0).sum()), hypotheses))
-    measured = hypotheses.select(hypotheses.counts).as_graph(scene.vertex_ids)
+    measured = hypotheses.as_graph(scene.vertex_ids, hypotheses.counts)
     graph = measured
     if scene.given is not None:
         graph = ViewGraph.joined([scene.given.as_graph(scene.vertex_ids), measured])
