@@ -131,3 +131,13 @@ def test_three_frames_stay() -> None:
     truth, times = true_path(count=3)
     before = noisy(truth)
     np.testing.assert_array_equal(smoothed(before, information(3), times), before)
+
+
+def test_the_usual_error_of_frames_that_see_in_one_direction_each_is_one() -> None:
+    """The medians of the entries of their information are those of no error: an eigenvalue is negative."""
+    truth, times = true_path()
+    before, told = noisy(truth), information().copy()
+    for row, seen in enumerate(np.array([[1.0, 1, 1], [1, 1, -1], [1, -1, 1]])):
+        told[row::3, 3:, 3:] = 1e6 * np.outer(seen, seen) + 1e3 * np.eye(3)
+    told[::5] = 0.0
+    assert errors(_smooth(before, told, times, key_frames(before, times)), truth)[1] < errors(before, truth)[1]

@@ -77,9 +77,17 @@ def _smooth(world_from_cam: Floats, information: Floats, stamps_s: Floats, key_f
     step_s = np.diff(stamps_s[rows])
     if not posed.any() or not len(step_s) or np.median(step_s) > VIDEO_STEP_S:
         return out
-    information = np.where(posed[:, None, None], information, np.median(information[posed], axis=0))
+    information = np.where(posed[:, None, None], information, _usual(information[posed]))
     joined = (np.diff(key_frames.part[rows]) == 0) & (np.diff(key_frames.sequence[rows]) == 0)
     broken = ~joined | (step_s <= 0) | (step_s > LONGEST_SPAN_S)
     for run in np.split(rows, np.flatnonzero(broken) + 1):
         out[run] = smoothed(world_from_cam[run], information[run], stamps_s[run])
     return out
+
+
+def _usual(information: Floats) -> Floats:
+    """The mean (6, 6) of information (N, 6, 6), each in units of its trace, in the usual one: positive definite as each
+    is, which medians of entries need not be.
+    """
+    trace = np.einsum("nii->n", information)
+    return np.asarray(np.median(trace) * (information / trace[:, None, None]).mean(axis=0))
