@@ -337,8 +337,10 @@ class ModelReader(Protocol):
     def open_models(self, source: Path | Sequence[Any]) -> Sequence[TrackedModel]:
         """The models at a path, or those that the format's own library holds in memory. Raises `SourceError`."""
 
-    def join(self, models: Sequence[TrackedModel]) -> Sequence[TrackedModel]:
-        """The models again, those that measurements tie together as one: in the gauge and unit of its largest."""
+    def join(self, models: Sequence[TrackedModel]) -> Sequence[tuple[TrackedModel, Sequence[int]]]:
+        """The models again, those that measurements tie together as one, in the gauge and unit of its largest; with
+        each the rows of those it is made of, the largest first. Every row is in one of them.
+        """
 
 
 @runtime_checkable

@@ -103,4 +103,4 @@ class Models:
         return [Model(model, self.how) for model in ColmapModels().open_models(source)]
 
     def join(self, models: Any) -> Any:
-        return models
+        return [(model, [row]) for row, model in enumerate(models)]

@@ -212,8 +212,9 @@ def test_the_terminal_has_ten_lines_of_80_columns_and_verbose_has_all(
     model = noisy(tmp_path)
     command = ["refine", "colmap", str(model), "--out", "out", "--set", FREE[0], "--overwrite"]
     monkeypatch.chdir(tmp_path)
-    brief = CliRunner().invoke(app, command).stdout.splitlines()
-    whole = CliRunner().invoke(app, [*command, "--verbose"]).stdout
+    verbose = CliRunner().invoke(app, [*command, "--verbose"])
+    brief, whole = CliRunner().invoke(app, command).stdout.splitlines(), verbose.stdout
+    assert "bundle adjustment: done" in verbose.stderr, "each step is told as it ends"
     assert brief[0].startswith("verdict  ") and brief[-1] == "report   out/report.html"
     assert len(brief) <= 10 and max(map(len, brief)) <= 80
     assert any("mean reprojection error" in line for line in brief)

@@ -114,6 +114,26 @@ def test_models_that_nothing_ties_stay_two(tmp_path: Path) -> None:
     assert {result.decision.outcome for result in done.results} <= {"optimal", "refined"}
 
 
+def test_a_model_that_joins_nothing_comes_out_once_though_it_shares_the_name_of_an_image(tmp_path: Path) -> None:
+    model = noisy(tmp_path, database=True)
+    cut(model, tmp_path / "sparse", TURN)
+    shared = pycolmap.Reconstruction(model).images[1].name
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_frames_per_rig, options.num_points3D = 5, 100
+    pycolmap.set_random_seed(1)
+    other = pycolmap.synthesize_dataset(options)
+    for image in other.images.values():
+        image.name = shared if image.image_id == 1 else f"other/{image.name}"
+    (tmp_path / "sparse/2").mkdir()
+    other.write(tmp_path / "sparse/2")
+    done = hodge_pipeline.refine_colmap(tmp_path / "sparse", out=tmp_path / "out", overrides=FREE)
+    assert [[Path(one.name).name for one in result.inputs] for result in done.results] == [["2"], ["0", "1"]]
+    assert [result.decision.outcome for result in done.results] == ["optimal", "refined"]
+    written = [pycolmap.Reconstruction(folder) for folder in sorted((tmp_path / "out/sparse").iterdir())]
+    assert [one.num_reg_images() for one in written] == [10, 8]
+    assert shared in poses_by_name(written[0]) and shared in poses_by_name(written[1])
+
+
 def test_a_broken_chain_is_closed_by_what_the_database_matched(tmp_path: Path) -> None:
     model = noisy(tmp_path, database=True)
     broken_chain(model, tmp_path / "chain", np.array([0.01, -0.02, 0.01, 0.02, 0.05, -0.03]))

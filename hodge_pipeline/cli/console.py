@@ -22,7 +22,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from hodge_pipeline.cli.guard import unguarded
@@ -54,7 +54,7 @@ class ProgressBars:
         self._recorded_s = 0.0
         self._draws = (self._console.is_terminal or self._console.is_jupyter) and not quiet
         self._progress = Progress(
-            TextColumn("{task.description:<24}"),
+            TextColumn("{task.description:<24}", table_column=Column(no_wrap=True, max_width=32)),
             BarColumn(),
             MofNCompleteColumn(),
             RateColumn(),

@@ -38,7 +38,7 @@ def refine(
     from hodge_pipeline.types.input_files import read_input_text
     from hodge_pipeline.uses.colmap import run_refinement
 
-    with resumable(out), ProgressBars.of(shown._replace(verbose=False)) as terminal:
+    with resumable(out), ProgressBars.of(shown) as terminal:
         done = run_refinement(model, options, out=out, force=force, overwrite=overwrite, watcher=terminal, dask=dask)
     if shown.as_json:
         print(read_input_text(out / "report.json"), end="")

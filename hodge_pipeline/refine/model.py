@@ -77,11 +77,10 @@ def refine_models(
     metric = [in_metres(model, scale) for model, scale in zip(models, scales, strict=True)]
     out = []
     with open_workers(options.executor, dask) as workers:
-        for number, joined in enumerate(options.model.join(metric)):
-            parts = [row for row, model in enumerate(metric) if set(model.body_names) & set(joined.body_names)]
+        for number, (joined, rows) in enumerate(options.model.join(metric)):
             joined = joined.placed()
             steps.remember(joined, f"{key}-{number}")
-            given = tuple(models[row] for row in parts), tuple(scales[row] for row in parts)
+            given = tuple(models[row] for row in rows), tuple(scales[row] for row in rows)
             out.append(_refine(joined, *given, options, steps, workers, force))
     return (replace(out[0], notes=(*left_out, *out[0].notes)), *out[1:])
 

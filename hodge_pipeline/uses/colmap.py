@@ -13,7 +13,7 @@ from hodge_pipeline.refine.model import RefinedModel, refine_models
 from hodge_pipeline.refine.model_options import RECIPE, ModelRefinement, load_model_refinement
 from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.store.cost import Monitor
-from hodge_pipeline.store.progress import Nobody, Watcher
+from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.store.store import Store
 from hodge_pipeline.uses.model_folder import model_workspace, write_run_folder
 
@@ -79,14 +79,13 @@ def run_refinement(
     dask: str | None = None,
 ) -> RefinedColmap:
     """The same with the options bound already."""
-    watcher = watcher or Nobody()
     is_path = isinstance(model, (str, Path))
     options = replace(options, source=str(model) if is_path else None)
     given = Path(model) if is_path else model if isinstance(model, (list, tuple)) else [model]
     with model_workspace(out, options, overwrite=overwrite) as workspace:
-        with Monitor().measure() as cost, watcher.stage("refine", 1):
+        with Monitor().measure() as cost:
             models = options.model.open_models(given)
-            steps = Store(workspace.steps)
+            steps = Store(workspace.steps, watcher)
             results = refine_models(models, options, steps, models_key(models, options, steps), force=force, dask=dask)
         if out is not None:
             write_run_folder(out, results, options, cost)

@@ -84,22 +84,21 @@ class ColmapModels:
         copy = pycolmap.Reconstruction(model)
         return alone._open(nowhere, copy, checked_content(copy, nowhere))
 
-    def join(self, models: Sequence[ColmapModel]) -> Sequence[ColmapModel]:
+    def join(self, models: Sequence[ColmapModel]) -> Sequence[tuple[ColmapModel, Sequence[int]]]:
         """The largest model takes in, one by one, those that enough tied points place in it."""
-        left = sorted(models, key=lambda model: -model.quality.images)
+        left = sorted(range(len(models)), key=lambda row: -models[row].quality.images)
         out = []
         while left:
-            whole, left = left[0], left[1:]
-            grown = True
-            while grown:
-                grown = False
-                for other in left:
-                    joined = _joined(whole, other)
-                    if joined is not None:
-                        whole, grown = joined, True
-                        left = [model for model in left if model is not other]
-                        break
-            out.append(whole)
+            rows, at = [left.pop(0)], 0
+            whole = models[rows[0]]
+            while at < len(left):
+                joined = _joined(whole, models[left[at]])
+                if joined is None:
+                    at += 1
+                else:
+                    rows.append(left.pop(at))
+                    whole, at = joined, 0
+            out.append((whole, rows))
         return out
 
     def _open(self, folder: Path, reconstruction: pycolmap.Reconstruction, content: Model) -> ColmapModel:
