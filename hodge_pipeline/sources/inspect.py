@@ -66,7 +66,7 @@ def inspect(path: Path, reader: FrameReader | None = None) -> dict[str, Any]:
     """
     known = guesses(path) if path.is_file() or path.is_dir() else []
     source = (reader or guess_reader(path, known)).open(path)
-    oddities = list(source.doubts)
+    oddities = list(map(str, source.doubts))
     unit = METRES if source.in_metres else OWN_UNIT
     facts: dict[str, Any] = {
         "path": str(path),

@@ -13,6 +13,7 @@ from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bools, Bytes, Floats, Floats32
+from hodge_pipeline.types.notes import Note
 
 PAIRS, SPAN_S, HOPS = 24, 0.35, 3
 """Pairs of frames, evenly over the sequence; how far apart, followed over so many frames between them."""
@@ -62,7 +63,7 @@ def fitting(
 
 def assumed_camera_doubts(
     taken: Intrinsics, depth: Sequence[Path], colour: Sequence[Path | None], stamps_s: Floats, units_per_metre: float
-) -> tuple[str, ...]:
+) -> tuple[Note, ...]:
     """A doubt unless frames agree best under the focal length of a camera that is only assumed, or one near to it.
 
     Raises `SourceError`, with the focal length that images tell, where they have another shape than that camera's.
@@ -81,7 +82,8 @@ def assumed_camera_doubts(
     mine = taken.fx * size[0] / width
     if told is not None and abs(told / mine - 1) < OTHER_FOCAL:
         return ()
-    return (f"a camera of focal length {mine:g} is assumed{fits or ', which the images do not test'}: {remedy}",)
+    told_by = fits or ", which the images do not test"
+    return (Note("reader's doubt", detail=f"a camera of focal length {mine:g} is assumed{told_by}: {remedy}"),)
 
 
 def focal_px(
