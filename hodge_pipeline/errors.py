@@ -26,6 +26,14 @@ class SourceError(HodgeError):
     """The input cannot be read: names the file, the frame or record, and the remedy."""
 
 
+class CameraError(SourceError):
+    """Nothing tells the intrinsics of images of this `size` (width, height): `camera` is to be given to the reader."""
+
+    def __init__(self, message: str, size: tuple[int, int] = (0, 0), camera: str = "[fx,fy,cx,cy]") -> None:
+        super().__init__(f"{message}: give those of your camera with --set source.reader.camera={camera}")
+        self.size, self.camera = size, camera
+
+
 class GraphError(HodgeError):
     """A viewing graph, or the numbers in it, cannot be used as given."""
 

@@ -23,13 +23,16 @@ from hodge_pipeline.complex.cycles import loop_products
 from hodge_pipeline.complex.holes import unfilled_loops
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.errors import GraphError, HodgeError
+from hodge_pipeline.pairs.edits import Listed, pairs_to_register
 from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.refine.pose_graph import disabled_edges
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.diagnosis_page import PageContents, edge_table, frames_table
 from hodge_pipeline.report.diagnosis_plots import side_by_side as pieces_apart
 from hodge_pipeline.report.edge_pictures import BLUE, ORANGE, _exaggeration, _views, side_by_side
 from hodge_pipeline.report.energy import energy_rows
-from hodge_pipeline.types import PointCloud, ViewGraph
+from hodge_pipeline.types import Edges, PointCloud, ViewGraph
+from hodge_pipeline.types.text import number_of, with_symbols
 from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject, write_diagnosed
 from readers_data import tum_folder
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
@@ -79,6 +82,33 @@ def test_the_wrong_edge_is_printed_first_with_what_to_do(wrong_edge: tuple[Path,
     rows = hodge(folder / "ring.g2o", "--verbose").split("verdict  1 of 36")[0]
     assert re.search(rf"{i}-{j} +wrong +0\.\d\d +0 of \d+ cycles close.*disable it", rows)
     assert "note     cycles: " in rows and "energy   rotation " in rows
+
+
+def test_symbols_of_gtsam_are_named_as_it_prints_them(tmp_path: Path) -> None:
+    """The ids themselves stay in the table; what is printed can be typed."""
+    graph, poses = ring(reach=3, first_id=ord("a") << 56)
+    spoil(graph, 17)
+    write_g2o(tmp_path / "ring.g2o", graph, poses)
+    text = hodge(tmp_path / "ring.g2o", "--out", tmp_path / "why")
+    verdict, first, *_, last = text.splitlines()
+    assert verdict == "verdict  1 of 36 edges is wrong, worst of all a5–a7."
+    assert first.startswith("  - a5-a7 wrong: 0 of ") and last.endswith("--disable a5-a7")
+    page, table = ((tmp_path / "why" / name).read_text("utf-8") for name in ("diagnosis.html", "edges.csv"))
+    assert "a5–a7" in page and not re.search(r"\d{19}", page)
+    assert all(re.fullmatch(r"\d{19},\d{19},\D.*", line) for line in table.splitlines()[1:])
+    assert not re.search(r"\d{19}", "".join(row["why"] for row in csv.DictReader(table.splitlines())))
+    assert disabled_edges(graph, ["a7-a5"]).nonzero()[0].tolist() == [17]
+    listed = Listed(Edges.measured(graph), graph.vertex_ids.astype(str))
+    assert listed.named(["a5-a7"]) == (f"{graph.vertex_ids[5]}-{graph.vertex_ids[7]}",)
+    assert pairs_to_register(listed.edges, graph.vertex_ids, ["a0-a6"]) == (f"{ord('a') << 56}-{(ord('a') << 56) + 6}",)
+
+
+def test_only_symbols_of_gtsam_are_named_so() -> None:
+    a12 = (ord("a") << 56) + 12
+    assert with_symbols(f"{a12}–{a12 + 1}, x{a12}.") == "a12–a13, xa12."
+    kept = f"{a12}0 0.{a12} {1628069034624019000} {(ord('a') << 56) + (1 << 48)} {ord('[') << 56} 12-87"
+    assert with_symbols(kept) == kept
+    assert [number_of(name) for name in ("a12", "12", "a012", "ab1", "")] == [str(a12), "12", "a012", "ab1", ""]
 
 
 def test_many_wrong_edges_are_left_out_by_one_short_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -64,7 +64,7 @@ def test_an_assumed_camera_that_images_contradict_is_told(office: Path, monkeypa
     source = options.open(office)
     assert source.doubts == () and any("Redwood's intrinsics taken" in note for note in source.notes)
     monkeypatch.setattr("hodge_adapters.icl_nuim.reader.REDWOOD", Intrinsics(400.0, 400.0, 319.5, 239.5, (640, 480)))
-    (doubt,) = options.open(office).doubts
+    (doubt,) = map(str, options.open(office).doubts)
     assert "focal length 400 is assumed" in doubt and ",319.5,239.5]" in doubt
     assert doubt in inspect(office, options)["oddities"]
     assert IclNuimReader(depth_scale=5000.0, camera=(400.0, 400.0, 319.5, 239.5)).open(office).doubts == ()

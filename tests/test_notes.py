@@ -22,8 +22,8 @@ def test_an_unknown_kind_is_refused_by_name() -> None:
 
 
 def test_doubt_comes_before_what_only_informs() -> None:
-    notes = [Note("solver", detail="a"), Note("parts", 2), Note("untestable", 3, "9")]
-    assert [note.rank for note in sorted(notes, key=lambda note: note.rank)] == [Rank.DOUBT, Rank.LOOK, Rank.FACT]
+    notes = [Note("solver", detail="a"), Note("parts", 2), Note("untestable", 3, "9"), Note("depth range", detail="a")]
+    assert sorted(note.rank for note in notes) == [Rank.INPUT, Rank.DOUBT, Rank.LOOK, Rank.FACT]
 
 
 def test_a_note_of_one_speaks_of_one() -> None:

@@ -11,7 +11,9 @@ import pytest
 from hodge_adapters.icl_nuim.reader import IclNuimReader
 from hodge_adapters.seven_scenes.reader import SevenScenesReader
 from hodge_adapters.tum.reader import TumReader
+from hodge_pipeline.cli.list import next_command
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.sources.inspect import inspect
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera
 from readers_data import (
@@ -51,6 +53,18 @@ def test_images_of_another_shape_than_the_intrinsics_are_refused_in_one_line(tmp
         write_depth(image, depth_values(shape=(9, 16)))
     with pytest.raises(SourceError, match=r"images of 16x9, but intrinsics of 640x480: give .*camera="):
         SevenScenesReader().open(sequence)
+
+
+def test_images_without_intrinsics_are_described_with_what_is_missing(tmp_path: Path) -> None:
+    folder = tum_folder(tmp_path / "sequence")
+    for image in (folder / "depth").iterdir():
+        write_depth(image, depth_values(shape=(9, 16)))
+    facts = inspect(folder)
+    assert facts["frames"] == 3 and facts["frames looked into"] == 3
+    assert facts["cameras"] == ["16x9, intrinsics unknown"]
+    assert facts["missing"] == ["source.reader.camera=[fx,fy,cx,cy]"]
+    assert "images of 16x9, but intrinsics of" in facts["oddities"][0]
+    assert "--set 'source.reader.camera=[fx,fy,cx,cy]' --out" in next_command(folder, facts, None)
 
 
 def test_colour_of_a_larger_camera_is_brought_to_the_size_of_depth(tmp_path: Path) -> None:

@@ -180,6 +180,7 @@ def test_bad_lines_are_left_out_and_noted(folder: Path) -> None:
     assert "depth.txt: 3 lines that name no file in the folder left out: 9, 10, 11" in source.notes
     assert "depth.txt: 1 line with the stamp of an earlier one left out" in source.notes
     assert "1 depth images listed but not there left out: gone.png" in source.notes
+    assert str(source.doubts[0]).startswith("1 of 4 listed depth images are missing: ")
     assert not any("secret" in str(file) for file in source.files)
 
 
@@ -194,6 +195,9 @@ def test_colour_that_is_absent_or_too_late(folder: Path) -> None:
     source = check_reader(TumReader(), folder)
     assert colour_names(source) == ["10.010000.png", None, "11.260000.png"]
     assert "1 colour images listed but not there: 10.510000.png" in source.notes
+    assert [str(doubt) for doubt in source.doubts[:1]] == [
+        "1 of 3 listed colour images are missing: unpack or copy the whole sequence"
+    ]
     source = TumReader(max_difference_s=0.005).open(folder)
     assert colour_names(source) == [None] * 3
     assert (

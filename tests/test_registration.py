@@ -99,6 +99,17 @@ def test_degenerate_clouds_are_unregistered_not_a_crash(name: str, case: str) ->
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_clouds_too_small_to_align_print_nothing(name: str, capfd: pytest.CaptureFixture[str]) -> None:
+    registrar = registry.load("registration", name)()
+    whole = seen_from(WORLD_FROM_I, 1)
+    few = PointCloud(*(array[:10] for array in (whole.points_in_cam, whole.normals_in_cam, whole.colours)))
+    for target, source in ((whole, few), (few, whole)):
+        found = registrar.register(registrar.prepare(target), registrar.prepare(source), np.eye(4))
+        assert not found.converged and not found.correspondences
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_information_is_symmetric_and_positive_in_a_corner(name: str) -> None:
     information = register(name).information
     np.testing.assert_allclose(information, information.T, rtol=1e-9)

@@ -257,6 +257,7 @@ def test_a_hole_is_a_step_much_longer_than_the_others_of_its_sequence() -> None:
     assert not len(gaps(rows[:1], stamps))
     assert not len(gaps(rows, stamps[::-1]))  # no clock
     assert not len(gaps([], stamps))
+    assert not len(gaps([np.arange(6)], np.array([0, 0.001, 0.002, 0.018, 0.019, 0.02]))), "a video's step is no hole"
 
 
 def test_sequences_are_not_joined_and_stand_apart(folder: Path) -> None:

@@ -146,12 +146,37 @@ def test_a_path_in_doubt_says_so_first(report: Report) -> None:
     assert verdict.headline == "In doubt, since much of the image moves: improved against odometry"
     doubts = (*report.notes, Note("camera or object", 10, "1–9, 12"), Note("depth unit", detail="its steps"))
     headline = judge(replace(report, notes=doubts)).headline
-    reasons = "much of the image moves and depth is probably not in metres"
+    reasons = "depth is probably not in metres and much of the image moves"
     assert headline == f"In doubt, since {reasons}: improved against odometry"
     assert verdict.mark == "mixed"
     doubt = Note("reader's doubt", detail="a camera of focal length 525 is assumed")
     verdict = judge(replace(report, notes=(doubt,)))
     assert verdict.headline.startswith("In doubt, since the camera is assumed and images do not confirm it: improved")
+
+
+def test_lost_frames_and_missing_images_come_first_where_they_are_most(report: Report) -> None:
+    """20 frames: what fits better is said of the few that are left."""
+    headlines = [
+        judge(replace(report, notes=(Note("tracking lost", lost, "0–9"), *report.notes))).headline for lost in (10, 11)
+    ]
+    assert headlines[0].startswith("Improved against")
+    assert headlines[1] == "Tracking was lost at 11 of 20 frames: improved against odometry"
+    missing = replace(
+        report, notes=(Note("tracking lost", 20, "0–19"), Note("images missing", 980, "997 listed images"))
+    )
+    assert judge(missing).headline.startswith("980 of 997 listed images are missing: tracking was lost at 20 of 20")
+    assert judge(missing).mark == "mixed"
+
+
+def test_a_doubt_of_the_input_comes_before_what_follows_from_it(report: Report) -> None:
+    """Two notes have room in ten lines."""
+    notes = (
+        Note("unheld", 9, "10 steps"),
+        Note("camera or object", 9, "20 frames"),
+        Note("depth range", detail="0.161 m"),
+    )
+    (first, *_) = [line for line in brief(replace(report, notes=notes), "runs/a") if line.startswith("look")]
+    assert first.removeprefix("look").strip().startswith("0.161 m: is the depth scale right")
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.store.artifacts import json_text
 from hodge_pipeline.store.progress import RECORDING
 from hodge_pipeline.types.notes import Note, Rank
-from hodge_pipeline.types.text import visible
+from hodge_pipeline.types.text import visible, with_symbols
 
 WAITED_FOR_S = 1.0
 """A stage that is over sooner is not worth a line."""
@@ -119,7 +119,7 @@ class ProgressBars:
 
     def say(self, message: str) -> None:
         """One line above the bars."""
-        self._console.print(visible(message), markup=False)
+        self._console.print(visible(with_symbols(message)), markup=False)
 
 
 class RateColumn(ProgressColumn):
@@ -142,5 +142,5 @@ def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
     for row, name in enumerate(header):
         table.add_column(name, justify="left" if row == 0 or name in words else "right", overflow="fold")
     for cells in rows:
-        table.add_row(*(Text(visible(cell)) for cell in cells))
+        table.add_row(*(Text(visible(with_symbols(cell))) for cell in cells))
     Console(highlight=False, file=unguarded(sys.stdout)).print(table)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hodge_pipeline.cli.console import ProgressBars, print_json, print_table
 from hodge_pipeline.cli.options import Shown
-from hodge_pipeline.report.brief import COLUMNS, LABEL, LINES, at_most, labelled
-from hodge_pipeline.types.text import counted
+from hodge_pipeline.report.brief import LABEL, LINES, at_most, labelled, pointed
+from hodge_pipeline.types.text import counted, with_symbols
 
 if TYPE_CHECKING:
     from hodge_pipeline.report.energy import EnergyRow
@@ -72,12 +71,12 @@ def _lines(found: Diagnosed, out: Path | None, top: int | None, bad: int) -> lis
     tail = [line for note in worrying[:1] for line in at_most(labelled("look", note), 3)]
     tail += [line for one in _to_register(found)[:1] if bad for line in at_most(labelled("register", one), 1)]
     tail += [] if out is None else [f"{'report':<{LABEL}}{out / 'diagnosis.html'}"]
-    tail += [f"{'next':<{LABEL}}{command}" for command in found.commands]
+    tail += [f"{'next':<{LABEL}}{with_symbols(command)}" for command in found.commands]
     shown = min(bad, LINES - len(head) - len(tail) - 1) if top is None else top
     points = []
     for row in found.rows[: max(shown, 0)].tolist():
         name, verdict, _, why, _ = _cells(found, row)
-        points += at_most(textwrap.wrap(f"  - {name} {verdict}: {why}", COLUMNS), 1)
+        points += pointed(f"{name} {verdict}: {why}")
     left = found.subject.graph.edge_count - len(points)
     if left and (points or top is not None):
         where = "--verbose" if out is None else str(out / "edges.csv")

@@ -26,6 +26,7 @@ from hodge_pipeline.pairs.edits import (
 from hodge_pipeline.store.workspace import holding
 from hodge_pipeline.types import Edges
 from hodge_pipeline.types.edges import DISABLED, REJECTED
+from hodge_pipeline.types.text import command, with_symbols
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ def edit(folder: Path, pairs: Pairs, shown: Shown, *, undo: bool, listing: bool)
         print_json({"run": str(folder), "switches": history.switches, "edits": edits})
     elif not shown.quiet:
         if taken_back is not None:
-            print(f"undone     {taken_back}")
+            print(with_symbols(f"undone     {taken_back}"))
         _print(folder, history, listed, changed=changed, listing=listing or not changed)
 
 
@@ -99,16 +100,14 @@ def _words(pairs: Sequence[str]) -> list[str]:
 
 
 def _print(folder: Path, history: History, listed: Listed, *, changed: bool, listing: bool) -> None:
-    from hodge_pipeline.types.text import command
-
     if listing:
         for number, one in enumerate(history.edits, start=1):
-            print(f"{number:>3}  {one}")
+            print(with_symbols(f"{number:>3}  {one}"))
         if not history.edits:
             print("no edits")
     by_name = {name: row for row, name in reversed(list(enumerate(listed.names)))}
     for pair, switch in history.switches.items():
-        print(f"{switch:<10} {pair}{_facts(listed.edges, by_name.get(pair), switch)}")
+        print(with_symbols(f"{switch:<10} {pair}{_facts(listed.edges, by_name.get(pair), switch)}"))
     if changed:
         registers = "registers, " if history.registered else ""
         print(f"next       {command('hodge', 'solve', folder)}     ({registers}solves and fuses again)")

@@ -35,7 +35,9 @@ def unguarded(stream: TextIO) -> TextIO:
 
 def shown_error(error: object) -> str:
     """An error in one line that can be read: of what it quotes at length the beginning and the end."""
-    text = str(error)
+    from hodge_pipeline.types.text import with_symbols
+
+    text = with_symbols(str(error))
     cut = text if len(text) <= LONGEST_ERROR else f"{text[: LONGEST_ERROR // 2]} … {text[-LONGEST_ERROR // 2 :]}"
     return shown(cut)
 

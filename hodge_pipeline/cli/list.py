@@ -38,7 +38,8 @@ def next_command(path: Path, facts: dict[str, Any], reader: str | None, settings
     from hodge_pipeline.cli.reader_choice import IN_A_RECIPE
     from hodge_pipeline.recipe.recipe_file import recipe_names
 
-    options = [word for setting in settings for word in ("--set", IN_A_RECIPE + setting.removeprefix(IN_A_RECIPE))]
+    given = (*settings, *facts.get("missing", ()))
+    options = [word for setting in given for word in ("--set", IN_A_RECIPE + setting.removeprefix(IN_A_RECIPE))]
     name = reader or next((guess["reader"] for guess in facts["formats"]), "")
     if name == "colmap" and not facts["frames with depth"]:  # images alone are nothing to register
         return command("hodge", "refine", "colmap", path, "--out", f"runs/{path.stem}")

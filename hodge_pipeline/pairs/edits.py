@@ -18,7 +18,7 @@ from hodge_pipeline.store.workspace import REFINEMENT
 from hodge_pipeline.types import Bools, Edges, Floats, Ints
 from hodge_pipeline.types.arrays import Words
 from hodge_pipeline.types.edges import DISABLED, HELD_OUT
-from hodge_pipeline.types.text import command
+from hodge_pipeline.types.text import command, number_of
 
 FILE = "edits.json"
 EDGES = "edges.csv"
@@ -180,10 +180,11 @@ class Listed:
         for name, backwards in zip(self.names, pair_names(self.vertex_ids, self.edges.pairs[:, ::-1]), strict=True):
             known.setdefault(name, name)
             known.setdefault(backwards, name)
-        for pair in pairs:
-            if pair not in known:
+        found = [[known[name] for a, b in _cuts(pair) if (name := f"{a}-{b}") in known] for pair in pairs]
+        for pair, names in zip(pairs, found, strict=True):
+            if not names:
                 raise GraphError(f"{pair}: no edge joins these frames: give two ids of {EDGES}, as 12-87")
-        return tuple(dict.fromkeys(known[pair] for pair in pairs))
+        return tuple(dict.fromkeys(names[0] for names in found))
 
 
 def listed_edges(folder: Path) -> Listed:
@@ -235,5 +236,6 @@ def vertex_rows(vertex_ids: NDArray[np.generic], pairs: Sequence[str]) -> Ints:
 
 
 def _cuts(pair: str) -> list[tuple[str, str]]:
-    """Every way to read a pair, since an id may hold a hyphen."""
-    return [(pair[:k], pair[k + 1 :]) for k in range(1, len(pair)) if pair[k] == "-"]
+    """Every way to read a pair, since an id may hold a hyphen, or be named as gtsam prints it."""
+    cuts = [(pair[:k], pair[k + 1 :]) for k in range(1, len(pair)) if pair[k] == "-"]
+    return [*cuts, *((number_of(a), number_of(b)) for a, b in cuts)]

@@ -10,7 +10,8 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.types import Floats, Ints, Registration
 
-MIN_POINTS = 10
+MIN_POINTS = 11
+"""small_gicp prints a warning for each cloud of ten or fewer."""
 MIN_SIGMA_SHARE = 0.02
 """No sensor is better than 1/50 of the distance that it is matched within, 1 mm of 5 cm in a room: keeps noise-free
 (modelled) pairs finite in any unit."""

@@ -12,15 +12,19 @@ from hodge_pipeline.types.notes import Note
 
 LONGEST_USUAL = 10.0
 """Times the median step of a sequence; cameras that drop some frames, or keep some of them, stay below it."""
+NO_HOLE_S = 0.2
+"""The step of a video of 5 frames a second, over which tracking holds."""
 GAPS_TOLD = 5
 
 
 def longest_usual_step_s(stamps_s: Floats) -> float:
-    """What a step of a sequence with these stamps (N,) may last; ∞ where they do not ascend, and so are no clock."""
+    """What a step of a sequence with these stamps (N,) may last, a slow video's in any case; ∞ where they do not
+    ascend, and so are no clock.
+    """
     steps = np.diff(stamps_s)
     if len(steps) < 2 or not (steps > 0).all():
         return float("inf")
-    return LONGEST_USUAL * float(np.median(steps))
+    return max(LONGEST_USUAL * float(np.median(steps)), NO_HOLE_S)
 
 
 def over_gap(pairs: Ints, sequences: Sequence[Ints], stamps_s: Floats) -> Bools:

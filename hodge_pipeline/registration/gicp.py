@@ -141,6 +141,8 @@ class Vgicp(_SmallGicp):
 
     def register(self, target: PreparedCloud, source: PreparedCloud, i_from_j: Floats) -> Registration:
         """Cloud j (source) moved onto cloud i (target) from the guess."""
+        if len(target) and target.voxels.size() < MIN_POINTS:
+            return unregistered(np.asarray(i_from_j, np.float64))
 
         def align(sample: Any, guess: Floats, **criteria: float) -> Any:
             return small_gicp.align(target.voxels, sample, guess, **criteria)

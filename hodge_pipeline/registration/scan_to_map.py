@@ -134,7 +134,7 @@ class _Map:
         guess and none where nothing could be aligned.
         """
         self._sweep = self._thinned(points) if len(points) >= MIN_POINTS else None
-        if self._sweep is None or self._is_empty:
+        if self._sweep is None or self._sweep.size() < MIN_POINTS or self._is_empty:
             return guesses[0], None
         starts = [start for guess in guesses for start in (guess, self._coarse(guess))]
         found = [self._aligned(self._levels[-1], start) for start in starts]

@@ -9,6 +9,7 @@ from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.run_page import duration, next_commands, peak, worst_places
 from hodge_pipeline.report.verdict import judge, suspicions
 from hodge_pipeline.types.notes import Rank
+from hodge_pipeline.types.text import with_symbols
 
 COLUMNS, LINES, LABEL = 80, 10, 9
 FEWEST_POINTS, MOST_NOTES, MOST_OF_A_NOTE = 2, 2, 2
@@ -28,7 +29,7 @@ def brief(report: Report, folder: str) -> list[str]:
     if len(points) > room:
         left = len(points) - room + 1
         points = (*points[: room - 1], f"… and {left} more measures: --verbose")
-    return [*head, *(line for point in points for line in at_most(textwrap.wrap(f"  - {point}", COLUMNS), 1)), *tail]
+    return [*head, *(line for point in points for line in pointed(point)), *tail]
 
 
 def all_notes(report: Report) -> list[str]:
@@ -47,8 +48,13 @@ def _end(report: Report, folder: str) -> Iterator[str]:
 
 def labelled(label: str, text: str) -> list[str]:
     """The text beside its label, in as many lines as it takes; a path or a command is never broken."""
-    lines = textwrap.wrap(text, COLUMNS - LABEL, break_long_words=False, break_on_hyphens=False) or [""]
+    lines = textwrap.wrap(with_symbols(text), COLUMNS - LABEL, break_long_words=False, break_on_hyphens=False) or [""]
     return [f"{label:<{LABEL}}{lines[0]}", *(f"{'':<{LABEL}}{line}" for line in lines[1:])]
+
+
+def pointed(text: str) -> list[str]:
+    """The text as a point of a list, in one line."""
+    return at_most(textwrap.wrap(f"  - {with_symbols(text)}", COLUMNS), 1)
 
 
 def at_most(lines: list[str], count: int) -> list[str]:

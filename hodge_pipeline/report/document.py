@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
-from hodge_pipeline.types.text import markdown_table
+from hodge_pipeline.types.text import markdown_table, with_symbols
 
 Mark: TypeAlias = Literal["", "better", "same", "worse", "mixed", "not measured"]
 JPEG = b"\xff\xd8"
@@ -126,7 +126,7 @@ class Document:
 
 def render(document: Document) -> str:
     """The page, as HTML5 text."""
-    return _template().render(page=document)
+    return with_symbols(_template().render(page=document))
 
 
 def markdown(tables: Sequence[Table]) -> str:

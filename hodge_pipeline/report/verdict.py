@@ -38,7 +38,12 @@ REFINEMENTS: dict[str, Outcome] = {
     "refined": "improved", "solved": "improved", "optimal": "unchanged", "worse": "worse", "forced": "worse",
     "nothing": "not measured",
 }  # fmt: skip
-DOUBTS = {"unsettled": "not settled", "other scale": "in another scale than the truth"}
+DOUBTS = {
+    "images missing": "{count} of {detail} are missing",
+    "other scale": "in another scale than the truth",
+    "unsettled": "not settled",
+    "tracking lost": "tracking was lost at {count} of {frames} frames",
+}
 REASONS = {
     "camera or object": "much of the image moves",
     "unheld": "what frames share lets them slide",
@@ -47,7 +52,10 @@ REASONS = {
     "path scaled": "the path is of another size than the one given",
     "depth unit": "depth is probably not in metres",
 }
-"""How a headline begins where the run says that its result may be wrong, whatever was measured, and why."""
+"""How a headline begins where the run says that its result may be wrong, whatever was measured, and why; lost frames
+where they are `MOSTLY_LOST`."""
+MOSTLY_LOST = 0.5
+"""The share of the frames."""
 GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
 
 
@@ -96,9 +104,14 @@ def judge(report: Report) -> Verdict:
     if pieces:
         all_joined = report.source.unordered and len(report.pieces) == 1 and outcome in ("improved", "unchanged")
         headline = pieces if all_joined else f"{pieces}: {headline[:1].lower()}{headline[1:]}"
-    told = (*_unsettled(report), *_other_scale(report), *report.notes)
+    told = sorted((*_unsettled(report), *_other_scale(report), *report.notes), key=lambda note: note.rank)
     reasons = " and ".join(REASONS[note.kind] for note in told if note.kind in REASONS)
-    doubts = [DOUBTS[note.kind] for note in told if note.kind in DOUBTS]
+    frames = report.source.frames
+    doubts = [
+        DOUBTS[note.kind].format(count=note.count, detail=note.detail, frames=frames)
+        for note in told
+        if note.kind in DOUBTS and (note.kind != "tracking lost" or note.count > MOSTLY_LOST * frames)
+    ]
     doubts += [f"in doubt, since {reasons}"] if reasons else []
     doubts += [report.refinement.doubt] if report.refinement and report.refinement.doubt else []
     headline = capital(": ".join(f"{text[:1].lower()}{text[1:]}" for text in (*doubts, headline)))

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from hodge_pipeline import registry
-from hodge_pipeline.errors import HodgeError, SourceError
+from hodge_pipeline.errors import CameraError, HodgeError, SourceError
 from hodge_pipeline.sources.frame_facts import METRES, OWN_UNIT, frame_facts, trajectory_facts
 from hodge_pipeline.sources.graph_facts import graph_facts
 from hodge_pipeline.sources.unknown import unknown
 from hodge_pipeline.stages import FrameReader, Sniff
 from hodge_pipeline.store.workspace import is_run_folder
+from hodge_pipeline.types import Source
 
 
 @dataclass(frozen=True)
@@ -57,16 +58,27 @@ def guess_reader(path: Path, known: Sequence[Guess] | None = None) -> FrameReade
     return reader
 
 
+def _opened(reader: FrameReader, path: Path) -> tuple[Source, CameraError | None]:
+    """The source; where nothing tells the intrinsics of its images, with any camera, and the error."""
+    try:
+        return reader.open(path), None
+    except CameraError as error:
+        width, height = error.size
+        any_reader: Any = reader
+        return replace(any_reader, camera=(width, width, width / 2, height / 2)).open(path), error
+
+
 def inspect(path: Path, reader: FrameReader | None = None) -> dict[str, Any]:
     """Facts of a path as plain data: guesses, frames, stamps, cameras, depth, poses, graph, notes, oddities.
 
     The surest reader opens it where none is given.
 
-    Images are not read but for the depth of a few frames. What has no value (a range of nothing) is left out.
+    Images are not read but for the depth of a few frames. What has no value (a range of nothing) is left out. Options
+    that the reader cannot do without are `missing`.
     """
     known = guesses(path) if path.is_file() or path.is_dir() else []
-    source = (reader or guess_reader(path, known)).open(path)
-    oddities = list(source.doubts)
+    source, camera_error = _opened(reader or guess_reader(path, known), path)
+    oddities = [*map(str, filter(None, [camera_error])), *map(str, source.doubts)]
     unit = METRES if source.in_metres else OWN_UNIT
     facts: dict[str, Any] = {
         "path": str(path),
@@ -75,6 +87,9 @@ def inspect(path: Path, reader: FrameReader | None = None) -> dict[str, Any]:
     }
     if source.frames:
         facts.update(frame_facts(source.frames, oddities, unit))
+    if camera_error is not None:
+        facts["cameras"] = ["{}x{}, intrinsics unknown".format(*camera_error.size)]
+        facts["missing"] = [f"source.reader.camera={camera_error.camera}"]
     if source.trajectory is not None:
         facts["trajectory poses"] = len(source.trajectory)
         if not source.frames and len(source.trajectory):

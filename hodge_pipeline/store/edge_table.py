@@ -17,7 +17,7 @@ from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Edges
 from hodge_pipeline.types.arrays import Words
 from hodge_pipeline.types.input_files import read_input
-from hodge_pipeline.types.text import cell, cell_text, csv_text
+from hodge_pipeline.types.text import cell, cell_text, csv_text, with_symbols
 
 COLUMNS = {
     "source": "proposed_by",
@@ -60,7 +60,7 @@ def write_edges(path: Path, edges: Edges, vertex_ids: NDArray[np.generic], *, ha
 
 def _cells(name: str, column: NDArray[Any]) -> list[Any]:
     if column.dtype.kind == "U":
-        shown = {value: cell(value) for value in set(column.tolist())}
+        shown = {value: cell(with_symbols(value)) for value in set(column.tolist())}
         return [shown[value] for value in column.tolist()]
     if column.dtype.kind != "f":
         return list(column.tolist())

@@ -22,6 +22,7 @@ from hodge_pipeline.types.edges import Edges as Edges
 from hodge_pipeline.types.edges import Priors as Priors
 from hodge_pipeline.types.edges import Registration as Registration
 from hodge_pipeline.types.edges import ViewGraph as ViewGraph
+from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.positions import Positions as Positions
 
 
@@ -123,7 +124,7 @@ class Source:
     """What a reader's `open` gives: any of lazy frames, a trajectory, a measured graph.
 
     - `trajectory` is the whole trajectory that the frames' poses come from, on its own stamps, where there is one.
-    - `notes` say what was skipped or repaired, with counts: one line each; `doubts` what may be wrong about the rest.
+    - `notes` say what was skipped or repaired, with counts: one line each; `doubts` what may be wrong or missing.
     - `positions` of its frames that are known from elsewhere, such as satellite fixes; None where it has none.
     - `files` identify the input: a run is resumed only while their sizes and times are unchanged.
     - `contents` say what a recording holds, taken or not, a line each: its topics, its transforms.
@@ -142,7 +143,7 @@ class Source:
     contents: tuple[str, ...] = ()
     positions: Positions | None = None
     of_cameras: bool = False
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Note, ...] = ()
     in_metres: bool = True
     numbered_hz: float = 0.0
 

@@ -10,16 +10,34 @@ from hodge_pipeline.types.text import suiting
 
 
 class Rank(IntEnum):
-    """How much a reader should heed a note: it puts the result in doubt, needs a look, or only informs."""
+    """How much a reader should heed a note: the input may be wrong, and so what follows from it; the result is in
+    doubt; it needs a look; or it only informs.
+    """
 
-    DOUBT = 0
-    LOOK = 1
-    FACT = 2
+    INPUT = 0
+    DOUBT = 1
+    LOOK = 2
+    FACT = 3
 
 
-DOUBTS = {
+INPUTS = {
     "input changed": "{count} {count:file|files} of the input changed while the run read {count:it|them} ({detail}): "
     "run the same command again once {count:it stays as it is|they stay as they are}.",
+    "images missing": "{count} of {detail} are missing: unpack or copy the whole sequence",
+    "reader's doubt": "{detail}",
+    "depth unit": "Depth is probably not in metres: {detail}.",
+    "depth steps": "depth is of another sensor than a Kinect, Xtion, Astra or Structure sensor, or in another unit: "
+    "{detail}",
+    "depth range": "{detail}: is the depth scale right (source.reader.depth_scale)?",
+    "millimetres": "{detail}",
+    "other scale": "The true path is {detail} times as large as this one: depth is read in the wrong unit (--set "
+    "source.reader.depth_scale), or with another camera's focal length, or the truth is not in metres, or not of the "
+    "camera.",
+    "single frame": "{detail}: has a single frame: there is nothing to register, the model is that frame alone",
+}
+"""What may be wrong with the input: the sentence of each kind of note; `{count}` and `{detail}` are the note's, and of
+`{count:is|are}` the side that suits the count."""
+DOUBTS = {
     "ambiguous": "{count} of {detail} pairs {count:fits|fit} in several ways, as in a bare room, and "
     "{count:joins|join} nothing: take scans in between, with furniture or targets in sight.",
     "none joined": "No two are joined: {detail}.",
@@ -27,11 +45,6 @@ DOUBTS = {
     "image moves otherwise than the camera is said to. Compare the model with the scene, or leave these frames out.",
     "unheld": "The path may slide: at {count} of {detail} what both frames see, such as a bare wall, does not hold "
     "the camera in every direction, and no other edge tests the step.",
-    "reader's doubt": "{detail}",
-    "depth unit": "Depth is probably not in metres: {detail}.",
-    "other scale": "The true path is {detail} times as large as this one: depth is read in the wrong unit (--set "
-    "source.reader.depth_scale), or with another camera's focal length, or the truth is not in metres, or not of the "
-    "camera.",
     "path scaled": "The refined path is {detail} times as large as the one given: depth and the given poses are of "
     "two scales, or depth is warped, and nothing here tells which is right.",
     "path loose": "The length of the path is in doubt: {count} of {detail} sweeps {count:tells|tell} little of how "
@@ -43,15 +56,9 @@ DOUBTS = {
     "parts": "The viewing graph falls into {count} parts that nothing connects: their poses relative to each other "
     "mean nothing.",
 }
-"""What puts the result in doubt: the sentence of each kind of note; `{count}` and `{detail}` are the note's, and of
-`{count:is|are}` the side that suits the count."""
+"""What puts the result in doubt."""
 LOOKS = {
-    "millimetres": "{detail}",
-    "single frame": "{detail}: has a single frame: there is nothing to register, the model is that frame alone",
     "option unknown": "{detail}; made by another version: it is left out of what is shown",
-    "depth steps": "depth is of another sensor than a Kinect, Xtion, Astra or Structure sensor, or in another unit: "
-    "{detail}",
-    "depth range": "{detail}: is the depth scale right (source.reader.depth_scale)?",
     "tracking lost": "tracking was lost at {count} {count:frame|frames} ({detail}): {count:its pose lies between "
     "its|their poses lie between their} neighbours'",
     "blank images": "{count} {count:frame has|frames have} depth, but a colour image that shows nothing, black or of "
@@ -144,7 +151,7 @@ FACTS = {
 """What only informs; the first eight are what stages report in their own words."""
 WORDING = {
     kind: (rank, text)
-    for rank, texts in ((Rank.DOUBT, DOUBTS), (Rank.LOOK, LOOKS), (Rank.FACT, FACTS))
+    for rank, texts in ((Rank.INPUT, INPUTS), (Rank.DOUBT, DOUBTS), (Rank.LOOK, LOOKS), (Rank.FACT, FACTS))
     for kind, text in texts.items()
 }
 """Each kind's rank, and its sentence."""

@@ -12,6 +12,9 @@ _UNSEEN = "\x00-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ud800
 _ONE_LINE, _LINES = re.compile(f"[{_UNSEEN}]"), re.compile(f"(?![\n\t])[{_UNSEEN}]")
 _FORMULA = re.compile(r"['=+\-@\t\r]")
 _NO_STEM = re.compile(r"[^\w.+-]+")
+_NUMBER, _SYMBOL = re.compile(r"(?<![\d.])\d{19}(?!\d)"), re.compile(r"[A-Za-z](0|[1-9]\d{0,8})")
+SYMBOLS = 1 << 56
+"""Of one letter."""
 UNKNOWN_UNIT = "units"
 """Of lengths where nothing tells the scale."""
 MAX_STEM = 100
@@ -24,6 +27,23 @@ def visible(text: object, *, lines: bool = False) -> str:
     With `lines` line ends and tabs stay.
     """
     return (_LINES if lines else _ONE_LINE).sub(lambda found: ascii(found[0])[1:-1], str(text))
+
+
+def with_symbols(text: str) -> str:
+    """The text with each number that is one of gtsam's Symbols, a letter in the upper 8 of 64 bits and an index in the
+    others, as gtsam prints it: `a12`.
+    """
+    return _NUMBER.sub(_symbol, text)
+
+
+def _symbol(found: re.Match[str]) -> str:
+    letter, index = divmod(int(found[0]), SYMBOLS)
+    return f"{chr(letter)}{index}" if _SYMBOL.fullmatch(f"{chr(letter)}{index}") else found[0]
+
+
+def number_of(name: str) -> str:
+    """The number of a vertex that is named as `with_symbols` does; any other name as it is."""
+    return str(ord(name[0]) * SYMBOLS + int(name[1:])) if _SYMBOL.fullmatch(name) else name
 
 
 def counted(count: int, words: str) -> str:

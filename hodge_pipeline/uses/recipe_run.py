@@ -120,7 +120,7 @@ class _Run:
         )
         if not source.frames:
             raise SourceError(f"{path}: has no frames to register: give a sequence with depth or clouds")
-        self.store.note(*notes_of("reader", source.notes), *notes_of("reader's doubt", source.doubts))
+        self.store.note(*notes_of("reader", source.notes), *source.doubts)
         self.store.note(*depth_doubts(source.frames))
         if len(source.frames) == 1:
             self.store.note(Note("single frame", detail=str(path)))

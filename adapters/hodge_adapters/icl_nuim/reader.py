@@ -25,6 +25,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Frame, Source
+from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.text import counted
 
 ICL = Intrinsics(481.2, -480.0, 319.5, 239.5, (640, 480))
@@ -133,7 +134,14 @@ class IclNuimReader:
         frames = self._frames(listing, ICL, poses, 5000.0, notes, is_true=True)
         files = (*listing.files, *filter(None, [truth]), *listing.depth, *filter(None, listing.colour))
         return Source(
-            path.resolve().name, path, frames, trajectory, notes=tuple(notes), files=files, numbered_hz=VIDEO_HZ
+            path.resolve().name,
+            path,
+            frames,
+            trajectory,
+            notes=tuple(notes),
+            files=files,
+            doubts=listing.doubts,
+            numbered_hz=VIDEO_HZ,
         )
 
     def _frames(
@@ -173,7 +181,7 @@ class IclNuimReader:
         own = None if self.camera else find_camera_file(path)
         if own:
             notes.append(f"intrinsics from {own.relative_to(path)}")
-        doubts: tuple[str, ...] = ()
+        doubts: tuple[Note, ...] = ()
         if own is None and not self.camera:
             stamps_s = UNSTAMPED_STEP_S * listing.stamps_s
             doubts = assumed_camera_doubts(REDWOOD, listing.depth, listing.colour, stamps_s, self.depth_scale or 1000.0)

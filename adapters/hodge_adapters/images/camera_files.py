@@ -11,7 +11,7 @@ from pathlib import Path
 
 from hodge_adapters.images.pixels import common_size, same_shape
 from hodge_adapters.text_rows import read_rows, read_text, to_floats
-from hodge_pipeline.errors import SourceError
+from hodge_pipeline.errors import CameraError, SourceError
 from hodge_pipeline.types import Camera
 
 _ENTRY = re.compile(r"^\s*\"?(?:Camera\d?\.)?(\w+)\"?\s*[:=]\s*([-+0-9.eE]+)\s*[,;]?\s*(?:#.*)?$", re.MULTILINE)
@@ -62,14 +62,13 @@ class Intrinsics:
 
     def camera_of(self, images: Sequence[Path], notes: list[str]) -> Camera:
         """The camera of these images: intrinsics of another size are scaled, which is noted, where the shape is the
-        same. Raises `SourceError` where it is not.
+        same. Raises `CameraError` where it is not.
         """
         size = common_size(images)
         told = self.camera(size)
         if not same_shape((told.width, told.height), size):
-            raise SourceError(
-                f"{images[0].parent}: images of {size[0]}x{size[1]}, but intrinsics of {told.width}x{told.height}: "
-                "give those of your camera with --set source.reader.camera=[fx,fy,cx,cy]"
+            raise CameraError(
+                f"{images[0].parent}: images of {size[0]}x{size[1]}, but intrinsics of {told.width}x{told.height}", size
             )
         if (told.width, told.height) != size:
             notes.append(f"intrinsics of {told.width}x{told.height} are scaled to the images' {size[0]}x{size[1]}")

@@ -11,8 +11,9 @@ import numpy as np
 
 from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics
-from hodge_pipeline.errors import SourceError
+from hodge_pipeline.errors import CameraError, SourceError
 from hodge_pipeline.types import Bools, Bytes, Floats, Floats32
+from hodge_pipeline.types.notes import Note
 
 PAIRS, SPAN_S, HOPS = 24, 0.35, 3
 """Pairs of frames, evenly over the sequence; how far apart, followed over so many frames between them."""
@@ -62,26 +63,27 @@ def fitting(
 
 def assumed_camera_doubts(
     taken: Intrinsics, depth: Sequence[Path], colour: Sequence[Path | None], stamps_s: Floats, units_per_metre: float
-) -> tuple[str, ...]:
+) -> tuple[Note, ...]:
     """A doubt unless frames agree best under the focal length of a camera that is only assumed, or one near to it.
 
-    Raises `SourceError`, with the focal length that images tell, where they have another shape than that camera's.
+    Raises `CameraError`, with the focal length that images tell, where they have another shape than that camera's.
     """
     size = pixels.common_size(depth)
     told = focal_px(size, depth, colour, stamps_s, units_per_metre)
     centre = size[0] / 2 - 0.5, size[1] / 2 - 0.5
     camera = f"[{told:.0f},{told:.0f},{centre[0]:g},{centre[1]:g}]" if told else "[fx,fy,cx,cy]"
-    remedy = f"give those of your camera with --set source.reader.camera={camera}"
     fits = f"; a focal length of about {told:.0f} pixels fits the images best" if told else ""
     width, height = taken.size or size
     if not pixels.same_shape((width, height), size):
-        raise SourceError(
-            f"{depth[0].parent}: images of {size[0]}x{size[1]}, but intrinsics of {width}x{height}{fits}: {remedy}"
+        raise CameraError(
+            f"{depth[0].parent}: images of {size[0]}x{size[1]}, but intrinsics of {width}x{height}{fits}", size, camera
         )
     mine = taken.fx * size[0] / width
     if told is not None and abs(told / mine - 1) < OTHER_FOCAL:
         return ()
-    return (f"a camera of focal length {mine:g} is assumed{fits or ', which the images do not test'}: {remedy}",)
+    doubt = f"a camera of focal length {mine:g} is assumed{fits or ', which the images do not test'}"
+    remedy = f"give those of your camera with --set source.reader.camera={camera}"
+    return (Note("reader's doubt", detail=f"{doubt}: {remedy}"),)
 
 
 def focal_px(

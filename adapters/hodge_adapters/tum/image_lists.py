@@ -16,11 +16,14 @@ from hodge_adapters.text_rows import Row, inside, listed, read_rows, to_floats
 from hodge_adapters.trajectories.text import in_seconds, is_stamp
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera, Floats, Frame, Ints
+from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.text import counted
 
 ASSOCIATION_FILES = ("associations.txt", "association.txt", "associate.txt", "associated.txt")
 LONGEST_DELAY_S = 0.1
 """Between the images of one frame: stamps further apart are not of one clock."""
+MISSING = 0.1
+"""The share of the listed images from which it is a doubt that they are missing: a sequence loses single ones."""
 _STAMP_NAME = re.compile(r"\d+\.\d+\.(png|jpg|jpeg)", re.IGNORECASE)
 _DEPTH_NAME = re.compile(r"depth", re.IGNORECASE)
 
@@ -29,6 +32,7 @@ _DEPTH_NAME = re.compile(r"depth", re.IGNORECASE)
 class StampedImages:
     """Depth images in order of their stamps, each with its colour image where there is one, and how many seconds later
     that was taken. `runs (N,)` number the parts, in the order of the file, between jumps of the clock back in time.
+    `doubts` are told where many listed images are missing.
     """
 
     stamps_s: Floats
@@ -37,6 +41,7 @@ class StampedImages:
     colour_delays_s: Floats
     files: tuple[Path, ...]
     runs: Ints
+    doubts: tuple[Note, ...] = ()
 
     @property
     def ids(self) -> list[int]:
@@ -87,6 +92,12 @@ def read_pairs(folder: Path, max_difference_s: float, notes: list[str]) -> Stamp
     if lost:
         notes.append(f"{len(lost)} colour images listed but not there: {listed(lost)}")
     rows = np.flatnonzero(there).tolist()
+    counts = {"depth": (len(there) - len(rows), len(there)), "colour": (len(lost), sum(map(bool, found.colour)))}
+    doubts = [
+        Note("images missing", missing, f"{total} listed {kind} images")
+        for kind, (missing, total) in counts.items()
+        if missing > MISSING * total
+    ]
     return StampedImages(
         found.stamps_s[rows],
         [found.depth[row] for row in rows],
@@ -94,6 +105,7 @@ def read_pairs(folder: Path, max_difference_s: float, notes: list[str]) -> Stamp
         found.colour_delays_s[rows],
         found.files,
         found.runs[rows],
+        tuple(doubts[:1]),
     )
 
 

@@ -23,6 +23,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Source, Trajectory
+from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.text import counted
 
 UNITS_PER_METRE = 5000.0
@@ -112,7 +113,7 @@ class TumReader:
         listing = read_pairs(path, self.max_difference_s, notes)
         found, camera_file = self._intrinsics(path, listing, notes)
         scale = self.depth_scale or found.units_per_metre or UNITS_PER_METRE
-        doubts = self._doubts(found, listing, scale)
+        doubts = (*listing.doubts, *self._doubts(found, listing, scale))
         camera = found.camera_of(listing.depth, notes)
         lens = Lens(camera, found.distortion) if found.distortion and self.undistort else None
         if found.distortion:
@@ -174,7 +175,7 @@ class TumReader:
         scale = self.depth_scale or UNITS_PER_METRE
         return fitting(CAMERAS, "default", listing.depth, listing.colour, listing.stamps_s, scale)
 
-    def _doubts(self, taken: Intrinsics, listing: StampedImages, scale: float) -> tuple[str, ...]:
+    def _doubts(self, taken: Intrinsics, listing: StampedImages, scale: float) -> tuple[Note, ...]:
         if taken is not CAMERAS["default"] or self.camera == "default":
             return ()
         return assumed_camera_doubts(taken, listing.depth, listing.colour, listing.stamps_s, scale)
