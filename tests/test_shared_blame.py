@@ -18,8 +18,10 @@ from hodge_pipeline.cli.main import app
 from hodge_pipeline.complex import short_cycles
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.wording import TOO_LONG
+from hodge_pipeline.solvers.backbone.trust import NONE
 from hodge_pipeline.types import ViewGraph
 
 CHAIN = [(k, k + 1) for k in range(9)]
@@ -212,10 +214,10 @@ def test_edges_of_a_loop_too_long_to_be_listed_are_told_from_those_of_none(
     poses = poses_on_a_ring(31)
     ring = near_pairs(30, 1)
     graph = measured(poses, np.concatenate([ring, [[0, 30]]]))
-    found = diagnose(graph)
+    found = diagnose(graph, DiagnosisOptions(trust=NONE))
     assert set(found.reason[:30]) == {TOO_LONG} and found.reason[30].startswith("no cycle passes it")
     path = tmp_path / "ring.g2o"
     write_g2o(path, graph, poses)
-    done = CliRunner().invoke(app, ["diagnose", str(path), "--out", str(tmp_path / "why")])
+    done = CliRunner().invoke(app, ["diagnose", str(path), "--trust", NONE, "--out", str(tmp_path / "why")])
     said = " ".join(done.stdout.split())
     assert "1 of 31 edges lies in no loop, so that nothing can test it; 30 lie in loops too long" in said
