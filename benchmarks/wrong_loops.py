@@ -5,6 +5,7 @@
     python -m benchmarks.wrong_loops classical           # loops put into graphs of the literature
     python -m benchmarks.wrong_loops clean               # graphs that nobody spoilt: how many edges are blamed
     python -m benchmarks.wrong_loops simulated --seed 1  # walks with 0 to 200 wrong loops, alone and in groups
+    python -m benchmarks.wrong_loops short --seed 1      # walks of 15 to 95 steps with few loops, some steps wrong
     python -m benchmarks.wrong_loops lattices --seed 1   # cylinders and grids with 1 to 20 % of all edges wrong
 
 Errors are metres RMS of positions after a rigid fit: to the truth, or for graphs of the literature to their own
@@ -15,10 +16,11 @@ the word.
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -207,6 +209,28 @@ def simulated_cases(seed: int) -> Iterator[Case]:
                         yield walked(name, poses, loops, wrong, group, stated, rng)
 
 
+def short_cases(seed: int) -> Iterator[Case]:
+    """Walks of few steps and few loops, of which none to .6 are wrong, with none to three steps wrong."""
+    kinds = itertools.product(
+        ("ring", "corridor"),
+        (15, 30, 60, 95),
+        (0.15, 0.3, 0.5),
+        ((0.0, 1), (0.3, 1), (0.3, 4), (0.6, 1), (0.6, 4)),
+        (0, 1, 3),
+    )
+    for number, (kind, count, share, (wrong, group), broken) in enumerate(kinds):
+        rng = np.random.default_rng([seed, number])
+        bad = round(wrong * share * count)
+        name = f"{kind} of {count}, {share:.0%} loops, {wrong:.0%} of them wrong by {group}, {broken} steps"
+        case = walked(name, walk(kind, count, rng), round(share * count) - bad, bad, group, True, rng)
+        rows = rng.choice(np.flatnonzero(steps(case.graph)), broken, replace=False)
+        off = np.zeros((broken, 6))
+        off[:, 2:5] = rng.normal(size=(broken, 3)) * [0.5, 1.5, 1.5]
+        motions, right = case.graph.i_from_j.copy(), case.right.copy()
+        motions[rows], right[rows] = motions[rows] @ se3.exp(off), False
+        yield replace(case, graph=replace(case.graph, i_from_j=motions), right=right)
+
+
 def walk(kind: str, count: int, rng: np.random.Generator) -> Floats:
     k = np.arange(count)
     if kind == "ring":
@@ -230,7 +254,7 @@ def walked(
 ) -> Case:
     count = len(poses)
     path = np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
-    i, j = np.triu_indices(count, 20)
+    i, j = np.triu_indices(count, min(20, count // 5))
     near = np.flatnonzero(np.linalg.norm(poses[i, :3, 3] - poses[j, :3, 3], axis=1) < 2.0)
     chosen = rng.choice(near, min(loops, len(near)), replace=False)
     pairs = np.concatenate([path, np.stack([i, j], axis=1)[chosen]])
@@ -280,6 +304,7 @@ KINDS = {
     "classical": classical_cases,
     "clean": clean_cases,
     "simulated": simulated_cases,
+    "short": short_cases,
     "lattices": lattice_cases,
 }
 

@@ -11,7 +11,6 @@ from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
-from hodge_pipeline.errors import GraphError
 from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.solvers.backbone import fit
 from hodge_pipeline.solvers.backbone.anyway import backbone_anyway
@@ -21,7 +20,7 @@ from hodge_pipeline.solvers.backbone.judge import left_out
 from hodge_pipeline.solvers.backbone.sparse import Network
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.solvers.maximum_likelihood import solve
-from hodge_pipeline.types import Priors, ViewGraph
+from hodge_pipeline.types import ViewGraph
 from tests.backbone_graphs import Drive, drive, round_trip
 
 NEVER_WORSE = 1.02
@@ -208,16 +207,6 @@ def test_loops_of_one_mistaken_place_close_no_path(dimension: int) -> None:
         assert not diagnose(made.graph).kept[~made.right].any()
 
 
-@pytest.mark.parametrize(("world", "count"), [("town", 60), ("corridor", 60), ("room", 90)])
-def test_short_sequences_with_few_loops_trust_their_steps(world: str, count: int) -> None:
-    """Where no edge is trusted most of these end 4 to 14 m off."""
-    for seed in range(3):
-        made = drive(world=world, count=count, seed=seed, loops=count // 3, wrong=0.5, in_groups=True, group=4)
-        found = diagnose(made.graph)
-        assert found.kept[np.abs(np.diff(made.graph.edges, axis=1)[:, 0]) == 1].all()
-        assert made.error_m(found.world_from_cam) <= 1.02 * made.error_m(made.odometry())
-
-
 def test_loops_that_are_stated_to_be_exact_refute_no_others(data_dir: Path) -> None:
     graph = read_graph(data_dir / "pose_graphs/sesync/MIT.g2o").graph
     assert graph is not None
@@ -336,58 +325,6 @@ def test_solvers_and_the_diagnosis_agree() -> None:
         np.testing.assert_allclose(solution.world_from_cam[0], np.eye(4), atol=1e-9)
 
 
-def test_trust_is_what_the_options_say() -> None:
-    graph = replace(drive().graph, source=np.repeat(["odometry", "places"], [399, 100]))
-    assert find_backbone(graph, "none") is None
-    by_source, by_order = find_backbone(graph, "odometry"), find_backbone(graph, "sequential")
-    assert by_source is not None and by_order is not None
-    np.testing.assert_array_equal(by_source.used, by_order.used)
-    with pytest.raises(GraphError, match="--trust gps: no edge comes from it; the edges come from odometry, places"):
-        find_backbone(graph, "gps")
-    with pytest.raises(ValueError, match="trust"):
-        DiagnosisOptions(trust="")
-
-
-def test_vertices_that_are_no_sequence_have_no_backbone() -> None:
-    graph = drive().graph
-    shuffled = np.random.default_rng(0).permutation(graph.vertex_count)
-    mixed = replace(graph, edges=shuffled[graph.edges])
-    assert find_backbone(mixed) is None
-    none = replace(mixed.select(np.zeros(1, np.int64)), edges=np.array([[0, 5]]))
-    with pytest.raises(GraphError, match="no edge joins consecutive vertices"):
-        find_backbone(none, "sequential")
-
-
-def test_ids_give_the_sequence_not_rows() -> None:
-    made = drive()
-    shuffled = np.random.default_rng(0).permutation(made.graph.vertex_count)
-    mixed = replace(made.graph, edges=shuffled[made.graph.edges], vertex_ids=np.argsort(shuffled) * 10)
-    np.testing.assert_array_equal(diagnose(mixed).kept, diagnose(made.graph).kept)
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("wrong", [0.0, 0.5])
-def test_robots_in_one_file_are_joined_by_loops_that_agree(dimension: int, wrong: float) -> None:
-    made = drive(dimension=dimension, wrong=wrong, count=600)
-    step = np.flatnonzero((np.sort(made.graph.edges, axis=1) == [249, 250]).all(axis=1))
-    rows = np.setdiff1d(np.arange(made.graph.edge_count), step)
-    robots = (ord("a") << 56) + np.arange(250), (ord("b") << 56) + np.arange(350)
-    graph = replace(made.graph.select(rows), vertex_ids=np.concatenate(robots))
-    found = diagnose(graph)
-    assert any("598 consecutive edges are trusted as a backbone" in note for note in found.notes)
-    assert not (found.kept & ~made.right[rows]).any()
-    assert (found.kept & made.right[rows]).sum() >= made.right[rows].sum() - 2
-    assert made.error_m(found.world_from_cam) < made.error_m(made.odometry())
-
-
-def test_robots_whose_loops_are_all_wrong_stay_apart() -> None:
-    made = drive(wrong=1.0, count=600, loops=60)
-    step = np.flatnonzero((np.sort(made.graph.edges, axis=1) == [249, 250]).all(axis=1))
-    found = diagnose(made.graph.select(np.setdiff1d(np.arange(made.graph.edge_count), step)))
-    assert not found.kept[598:].any() and found.kept[:598].all()
-    assert len(np.unique(found.piece)) == 2
-
-
 def test_more_loops_than_can_be_inverted_are_judged_at_the_poses_of_some(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fit, "MOST_UNKNOWNS", 150)
     made = drive(count=1500, dimension=3, world="town", loops=700)
@@ -401,18 +338,3 @@ def test_more_loops_than_can_be_inverted_are_judged_at_the_poses_of_some(monkeyp
     assert not (found.used & ~made.right).any()
     assert found.used[made.right].mean() > 0.95
     assert made.error_m(found.world_from_cam) < made.error_m(made.odometry())
-
-
-def test_priors_of_vertices_do_not_hinder_the_backbone() -> None:
-    """As of GPS: the loops were judged without a backbone, and all of 62 left out of a graph of hdl_graph_slam."""
-    made = drive(dimension=3, world="town", seed=2, wrong=0.5, loops=60)
-    at = np.arange(0, made.graph.vertex_count, 20)
-    known = np.tile(np.diag([0, 0, 0, 100.0, 100, 100]), (len(at), 1, 1))
-    priors = Priors(at, se3.from_parts(np.broadcast_to(np.eye(3), (len(at), 3, 3)), made.truth[at, :3, 3]), known)
-    graph = replace(made.graph, priors=priors)
-    found = diagnose(graph)
-    np.testing.assert_array_equal(found.kept, made.right)
-    solved = solve_robust(graph)
-    np.testing.assert_array_equal(solved.weights > 0, made.right)
-    off = np.linalg.norm(solved.world_from_cam[:, :3, 3] - made.truth[:, :3, 3], axis=1)
-    assert off.max() < 0.5  # in the world of the priors, without a fit

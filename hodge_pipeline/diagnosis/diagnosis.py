@@ -15,7 +15,7 @@ from hodge_pipeline.complex.judging import in_vertex_order
 from hodge_pipeline.complex.short_cycles import with_cycles_of
 from hodge_pipeline.diagnosis.consensus import find_consensus
 from hodge_pipeline.diagnosis.cycles import Cycles, judge_cycles, witnesses
-from hodge_pipeline.diagnosis.evidence import Evidence, gather
+from hodge_pipeline.diagnosis.evidence import Evidence, every_pair_tried, gather
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.on_backbone import judged_on_backbone
 from hodge_pipeline.diagnosis.options import CONSISTENT_FROM, WRONG_BELOW, DiagnosisOptions
@@ -54,7 +54,11 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
 
 
 def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbone | Diagnosis:
-    """The backbone of a graph that has one, else the diagnosis that trusts no edge."""
+    """The backbone of a graph that has one, else the diagnosis that trusts no edge, as of a room of which every pair of
+    views was tried.
+    """
+    if options.trust == AUTO and every_pair_tried(graph.edges, graph.vertex_count):
+        return _by_cycles(graph, options)
     backbone = find_backbone(graph, options.trust)
     if backbone is not None and not backbone.doubted:
         return backbone

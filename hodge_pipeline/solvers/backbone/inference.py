@@ -67,7 +67,11 @@ def infer(
     start = linearise(chain, poses)
     alone = judge(start, None, shares, wrong)
     inferred = partial(_inferred, start, alone, shares=shares, wrong=wrong, always=always, thin=thin, scales=scales)
-    found = inferred(alone.factor > np.log(max(len(always), 1)))
+    try:
+        found = inferred(alone.factor > np.log(max(len(always), 1)))
+    except np.linalg.LinAlgError:  # loops tear paths so far apart that rounding hides what is known of their ends
+        rows = np.flatnonzero(always)
+        return Inferred(always, alone, scales, start, start, thinned(chain, rows), 0.0, confirmed=False)
     if found is None or found.confirmed or not anew:
         return found
     # a lone wrong loop that chance favours may have refuted the others

@@ -23,12 +23,9 @@ from hodge_pipeline.types import Bools, Floats, ViewGraph
 from hodge_pipeline.types.text import counted
 
 AUTO, SEQUENTIAL, NONE = "auto", "sequential", "none"
-FEWEST_STEPS = 10
-"""Of a backbone that is looked for."""
-OF_ROOMS = 100
-"""Steps of its paths on average: shorter ones with many loops are fragments of rooms, whose edges test each other. Of
-960 simulated ones of 15 to 95 steps with few loops, up to .6 of them and up to three steps wrong, 4 end worse than the
-odometry, 319 where no edge is trusted.
+FEWEST_STEPS, MOST_PATHS = 10, 10
+"""Of a backbone that is looked for. Its paths have as many steps on average for each of the paths, up to as many, that
+loops must join: one path 10, ten or more 100.
 """
 COVERED = 0.9
 """Of the vertices that consecutive edges must join, so that a sequence is a backbone."""
@@ -113,10 +110,10 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
     chain = make_chain(graph, steps)
     if not len(chain.loop_edge):
         return None
-    loops, paths = len(chain.loop_edge), len(np.unique(chain.path[chain.step_edge >= 0]))
-    many_loops = loops > LOOPS_AT_A_STEP * steps.sum()
-    if trust == AUTO and steps.sum() < (OF_ROOMS if many_loops else FEWEST_STEPS) * paths:
+    paths = len(np.unique(chain.path[chain.step_edge >= 0]))
+    if trust == AUTO and steps.sum() < FEWEST_STEPS * min(paths, MOST_PATHS) * paths:
         return None
+    many_loops = len(chain.loop_edge) > LOOPS_AT_A_STEP * steps.sum()
     if anyway and not many_loops:
         return None
     if trust == AUTO and many_loops and not anyway and is_tested(chain):
