@@ -96,13 +96,13 @@ def test_priors_of_vertices_do_not_hinder_the_backbone() -> None:
 
 
 def test_a_path_of_a_few_steps_is_a_sequence_and_many_such_paths_are_none() -> None:
-    made = drive(count=400, loops=300)
+    made = drive()
     apart = np.arange(13, 399, 14)  # every 14th step is missing
     rows = np.flatnonzero(~np.isin(np.arange(made.graph.edge_count), apart))
     assert find_backbone(made.graph) is not None
     assert find_backbone(made.graph.select(rows)) is None
     assert find_backbone(made.graph.select(rows), "sequential") is not None
-    assert find_backbone(drive(count=14, loops=6).graph) is not None
+    assert find_backbone(drive(world="corridor", count=60, loops=20).graph) is not None
 
 
 def test_loops_that_nothing_can_be_computed_with_confirm_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

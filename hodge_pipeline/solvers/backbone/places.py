@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import gammaln
-from scipy.stats import poisson
+from scipy.special import pdtrc
 
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.solvers.backbone.breaks import Testimony
@@ -137,8 +137,8 @@ class Places:
         stronger = len(others) - np.searchsorted(np.sort(others), self.bare[strongest]) + 0.5
         sizes = np.sort(np.concatenate([self.size, self.unused]))
         as_large = len(sizes) - np.searchsorted(sizes, np.minimum.accumulate(self.size[strongest]))
-        tail = poisson.logsf(np.arange(len(strongest)), as_large * stronger / len(others))
-        return float(tail.min() + np.log(len(strongest)))
+        tail = pdtrc(np.arange(len(strongest)), as_large * stronger / len(others))  # of Poisson's distribution
+        return float(np.log(max(tail.min(), np.finfo(float).tiny)) + np.log(len(strongest)))
 
     def arranged(self, right: Bools, linear: Linear) -> Arrangement:
         """These places (K,) taken for right, at the poses that are reached from some others."""
