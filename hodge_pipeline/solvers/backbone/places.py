@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.special import gammaln
-from scipy.special import pdtrc
+from scipy.special import gammaln, pdtrc
 
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.solvers.backbone.breaks import Testimony
