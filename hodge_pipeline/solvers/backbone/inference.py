@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
@@ -66,12 +66,15 @@ def infer(
     chain = scales.applied(chain)
     start = linearise(chain, poses)
     alone = judge(start, None, shares, wrong)
-    inferred = partial(_inferred, start, alone, shares=shares, wrong=wrong, always=always, thin=thin, scales=scales)
-    try:
-        found = inferred(alone.factor > np.log(max(len(always), 1)))
-    except np.linalg.LinAlgError:  # loops tear paths so far apart that rounding hides what is known of their ends
-        rows = np.flatnonzero(always)
-        return Inferred(always, alone, scales, start, start, thinned(chain, rows), 0.0, confirmed=False)
+
+    def inferred(used: Bools) -> Inferred | None:
+        try:
+            return _inferred(start, alone, used, shares=shares, wrong=wrong, always=always, thin=thin, scales=scales)
+        except np.linalg.LinAlgError:  # loops tear paths so far apart that rounding hides what is known of their ends
+            rows = np.flatnonzero(always)
+            return Inferred(always, alone, scales, start, start, thinned(chain, rows), 0.0, confirmed=False)
+
+    found = inferred(alone.factor > np.log(max(len(always), 1)))
     if found is None or found.confirmed or not anew:
         return found
     # a lone wrong loop that chance favours may have refuted the others
