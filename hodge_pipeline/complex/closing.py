@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import gammainc, gammaln
+from scipy.special import chndtr, gammaln
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.cycles import Loops, directed, loop_products
-from hodge_pipeline.complex.short_cycles import loops_of_chords
-from hodge_pipeline.types import Floats, Ints, ViewGraph
+from hodge_pipeline.complex.short_cycles import short_cycles
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 AT_MIDDLE = 4
 """Frames of a cycle, the first ones, whose middle is where its displacement is measured."""
@@ -20,6 +20,9 @@ UNIFORM_RAD2 = (8 * math.pi**2) ** (2 / 3) / (2 * math.pi)
 """Variance of an axis at which a Gaussian is as dense at 0 as uniform rotations, which spread no wider."""
 FLAT = 100.0
 """Times as large as usual along the axis that moves most are squares of motions along one that holds noise alone."""
+FAR = 1e6
+"""Squared distance of an aim, in the variances of a walk, from which on that walk is no evidence."""
+TRIANGLES_PER_EDGE = 8
 
 
 def cycle_errors(loops: Loops, i_from_j: Floats, products: Floats | None = None) -> tuple[Floats, Floats]:
@@ -46,35 +49,73 @@ def _middles(loops: Loops, i_from_j: Floats) -> Floats:
 def closes_better_than_chance(graph: ViewGraph, kept: Ints) -> bool:
     """Whether the cycles of the kept edges (rows) close so well that no choice of random edges is expected to.
 
-    Around a cycle of edges in random directions the motion is a walk of their lengths, and the probability of a nearer
-    end is uniform; of C cycles, minus the sum of the logarithms is gamma distributed. Every choice of as many
-    of the edges counts, whichever the solver made: so that it chose the best makes nothing look better than it is.
+    Edges are revealed cycle by cycle, the shortest first. Each cycle with a run of edges that no cycle before it holds
+    is a test of its own: whatever the others are, a walk of the lengths of that run in random directions ends as
+    near to where the rest of the cycle leads with a probability that is uniform. So minus the sum of the logarithms
+    is gamma distributed although cycles share edges. Every choice of as many of the edges counts, whichever the
+    solver made: so that it chose the best makes nothing look better than it is.
     """
     graph, every = graph.select(kept), graph.edge_count
-    loops = loops_of_chords(graph.edges, graph.vertex_count)
+    loops, run = _begun_at_new_edges(short_cycles(graph.edges, graph.vertex_count, TRIANGLES_PER_EDGE))
     if not len(loops):
         return False
-    left, squares = se3.log(loop_products(loops, graph.i_from_j)), se3.log(graph.i_from_j) ** 2
-    usual = np.median(squares, axis=0)
-    most = np.repeat(usual.reshape(2, 3).max(axis=1), 3)
-    limit = np.repeat([UNIFORM_RAD2, np.inf], 3)
-    moving = usual > 0, usual > most / FLAT  # out of a plane there may be noise alone, which says nothing
     out, cycles = every - len(kept), len(loops)
-    log_choices = gammaln(every + 1) - gammaln(out + 1) - gammaln(len(kept) + 1) + math.log(len(moving) * every)
-    mean = max(
-        -float(_log_chance(loops, left[:, axes], squares[:, axes], limit[axes]).sum()) / cycles for axes in moving
-    )
+    log_choices = gammaln(every + 1) - gammaln(out + 1) - gammaln(len(kept) + 1) + math.log(every)
+    mean = -float(_log_chance(loops, run, graph.i_from_j).mean())
     # Chernoff's bound of the gamma distribution's tail
     return mean > 1 and cycles * (1 + math.log(mean) - mean) + log_choices < math.log(LEVEL)
 
 
-def _log_chance(loops: Loops, left: Floats, squares: Floats, most: Floats) -> Floats:
-    """The logarithm of how likely (L,) a cycle of edges in random directions leaves less than `left (L, a)` along some
-    axes; `squares (E, a)` of the edges' own motions, and the largest variances `most (a,)`.
+def _begun_at_new_edges(loops: Loops) -> tuple[Loops, Ints]:
+    """The cycles that hold an edge which no shorter or earlier one does, each begun at its first run of such edges;
+    and the length (L,) of that run.
     """
-    if not left.shape[1]:
-        return np.zeros(len(left))
-    spread = np.add.reduceat(squares[loops.edge], loops.offsets[:-1], axis=0)
-    spread = np.clip(spread, np.finfo(float).tiny, most)
-    chance = gammainc(left.shape[1] / 2, (left**2 / spread).sum(axis=1) / 2)
-    return np.asarray(np.log(np.maximum(chance, np.finfo(float).tiny)))
+    loops = loops.select(np.argsort(loops.lengths, kind="stable"))
+    new = np.zeros(len(loops.edge), bool)
+    new[np.unique(loops.edge, return_index=True)[1]] = True
+    holds = np.zeros(len(loops), bool)
+    holds[loops.rows[new]] = True
+    new, loops = new[holds[loops.rows]], loops.select(np.flatnonzero(holds))
+    first, rows, lengths = loops.offsets[:-1], loops.rows, loops.lengths
+    place = np.arange(len(new)) - first[rows]
+
+    def least(wanted: Bools, otherwise: Ints) -> Ints:
+        """The first place (L,) in each cycle where `wanted (N,)` is."""
+        return np.minimum(np.minimum.reduceat(np.where(wanted, place, len(new)), first), otherwise)
+
+    begin = least(new & ~new[first[rows] + (place - 1) % lengths[rows]], lengths) % lengths
+    entry = first[rows] + (place + begin[rows]) % lengths[rows]
+    return Loops(loops.offsets, loops.edge[entry], loops.sign[entry]), least(~new[entry], lengths)
+
+
+def _log_chance(loops: Loops, run: Ints, i_from_j: Floats) -> Floats:
+    """The logarithm of how likely (L,) walks of the first `run (L,)` motions of the cycles, turned at random, end as
+    near as these do to where the others lead.
+
+    Rotations are judged as if the others did not turn, which makes no chance smaller (Anderson, 1955).
+    """
+    rows = loops.rows
+    of_run = np.arange(len(rows)) - loops.offsets[:-1][rows] < run[rows]
+    walk = Loops(np.concatenate([[0], np.cumsum(run)]), loops.edge[of_run], loops.sign[of_run])
+    end, left = loop_products(walk, i_from_j), loop_products(loops, i_from_j)
+    aim = se3.inverse(left) @ end
+    turn, shift, aim_m = se3.so3_log(i_from_j[:, :3, :3]), i_from_j[:, :3, 3], aim[:, :3, 3]
+    turns, shifts = _moving(turn, se3.so3_log(aim[:, :3, :3])), _moving(shift, aim_m)
+    spread_rad2 = np.clip(walk.sums(_variance(turn[:, turns])), np.finfo(float).tiny, UNIFORM_RAD2)
+    spread_m2 = np.maximum(walk.sums(_variance(shift[:, shifts])), np.finfo(float).tiny)
+    square = (se3.so3_log(left[:, :3, :3])[:, turns] ** 2).sum(axis=1) / spread_rad2
+    square += ((end[:, :3, 3] - aim_m)[:, shifts] ** 2).sum(axis=1) / spread_m2
+    centre = np.where(run == 1, (aim_m[:, shifts] ** 2).sum(axis=1) / spread_m2, 0.0)
+    chance = np.where(centre < FAR, chndtr(square, turns.sum() + shifts.sum(), np.minimum(centre, FAR)), 1.0)
+    return np.asarray(np.log(np.clip(chance, np.finfo(float).tiny, 1)))
+
+
+def _moving(of_edges: Floats, of_aims: Floats) -> Bools:
+    """The axes (3,) along which edges (E, 3) or what cycles say of them (L, 3) move, not by noise out of a plane."""
+    usual = np.maximum(np.median(of_edges**2, axis=0), np.median(of_aims**2, axis=0))
+    return np.asarray(usual > usual.max() / FLAT)
+
+
+def _variance(motions: Floats) -> Floats:
+    """Along each of the axes (N,) where motions (N, a) of these lengths go in random directions."""
+    return np.asarray((motions**2).sum(axis=1) / max(motions.shape[1], 1))

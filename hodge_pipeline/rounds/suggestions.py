@@ -18,6 +18,8 @@ NEAREST = 6
 """Nearest views of each view that are candidates, whatever edges there are."""
 TESTED_GAIN = 1.0
 """Nats for each untestable edge that becomes testable, added to the logarithm of the variance saved."""
+DIGITS = 9
+"""Of nats: pairs of equal worth come in order on every machine, not as it rounds."""
 EACH_VERTEX = 2
 """Suggestions that share a view add nearly the same information."""
 
@@ -114,7 +116,8 @@ def _best_first(pairs: Ints, kept: Ints, untestable: Ints, network: Network, mos
     gained: list[tuple[float, float, float]] = []
     while free.any() and len(rows) < most:
         tests = np.bincount(pair, is_open[edge], len(pairs))
-        score = np.log1p(np.where(np.isfinite(resistance), resistance, count)) + TESTED_GAIN * tests
+        variance = np.where(np.isfinite(resistance), resistance, count)
+        score = (np.log1p(variance) + TESTED_GAIN * tests).round(DIGITS)
         row = int(np.argmax(np.where(free, score, -np.inf)))
         rows.append(row)
         gained.append((float(score[row]), float(resistance[row]), float(tests[row])))
