@@ -1,7 +1,7 @@
 """Align a scene from its edges: pieces are merged greedily, those with the largest log-evidence first.
 
-Each round every piece picks the neighbour with the largest log-evidence and is merged with it, unless that neighbour
-has much better merges of its own to come (Borůvka's scheme for trees, with patience). Edges between two
+Each round every piece picks the neighbour with the largest log-evidence and is merged with it (Borůvka's scheme for
+trees). Edges between two
 pieces are votes on where one lies in the other. Once joined, all edges of both vote together, so that long cycles are
 tested without ever being listed. No edge is trusted: one that agrees with no other is left out.
 """
@@ -18,16 +18,12 @@ from hodge_pipeline.diagnosis.cycles import GATE
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.types import Bools, Floats, Ints
 
-PATIENCE = 0.7
-"""Of the best score that a piece has: weaker merges wait, since more edges may then vote on their placement."""
 HYPOTHESES = 24
 """Votes of a pair of pieces, the weightiest, that are tried as the answer."""
 MOST_PAIRS_TO_A_VOTE = 400
 PER_FOLD = 2.0
 """Nats that agreeing edges between two sets of views add per e-fold of their number: they are one event, since places
 that look alike give many wrong edges that agree."""
-DRIFT = 0.25
-"""Of an edge's variance, for each usual edge length between two votes: pieces are not solved while they grow."""
 
 
 @dataclass(frozen=True)
@@ -75,14 +71,13 @@ def _gains(evidence: Evidence, votes: Votes) -> Floats:
 def _joins(votes: Votes, gain: Floats, count: int) -> tuple[Ints, Bools]:
     """The hypotheses to join by, and whether it is the lower of the two pieces that moves.
 
-    A piece moves to the one with the largest log-evidence, if that one stays where it is in this round and has no much
-    better join of its own to wait for.
+    A piece moves to the one with the largest log-evidence, if that one stays where it is in this round.
     """
     order = np.lexsort((-gain, votes.pair))
     best = order[votes.start]
     real = np.flatnonzero(gain[best] > 0)
     real = real[np.lexsort((real, -gain[best][real]))]
-    low, high, score = votes.low[real], votes.high[real], gain[best][real]
+    low, high = votes.low[real], votes.high[real]
     first = np.full(count, len(real))
     np.minimum.at(first, low, np.arange(len(real)))
     np.minimum.at(first, high, np.arange(len(real)))
@@ -90,8 +85,7 @@ def _joins(votes: Votes, gain: Floats, count: int) -> tuple[Ints, Bools]:
     has_moved, base = np.zeros(count, bool), np.zeros(count, bool)
     for row in np.unique(first[first < len(real)]).tolist():
         for mover, other, lower in ((high[row], low[row], False), (low[row], high[row], True)):
-            wanted = first[mover] == row and score[row] >= PATIENCE * score[first[other]]
-            if wanted and not (has_moved[mover] or base[mover] or has_moved[other]):
+            if first[mover] == row and not (has_moved[mover] or base[mover] or has_moved[other]):
                 has_moved[mover] = base[other] = True
                 chosen.append(real[row])
                 moves_low.append(lower)
@@ -164,10 +158,8 @@ def agreement_of(evidence: Evidence, edge: Ints, motion: Floats, point: Floats, 
     apart = np.einsum("ni,ni->n", at - point[first], at - point[first])
     turn = evidence.noise.rotation_rad[edge] ** 2
     shift = evidence.noise.translation_m[edge] ** 2
-    slack = 1 + DRIFT * np.sqrt(apart) / evidence.reach_m
-    turn_both = (turn[first] + turn[second]) * slack
-    shift_both = (shift[first] + shift[second]) * slack + turn[first] * apart
-    chi2 = angle**2 / turn_both + np.einsum("ni,ni->n", moved, moved) / shift_both
+    shift_both = shift[first] + shift[second] + turn[first] * apart
+    chi2 = angle**2 / (turn[first] + turn[second]) + np.einsum("ni,ni->n", moved, moved) / shift_both
     return np.asarray(np.maximum(0.0, 1 - chi2 / GATE))
 
 

@@ -30,8 +30,6 @@ ROUNDING = 1e-9
 """Of a trace."""
 JUMP = 1e-4
 """Share of consecutive views that do not see the same place."""
-SURE = 5.0
-"""Nats, the most log-evidence of a single edge between consecutive views."""
 UNSUPPORTED, SUPPORTED = 0.05, 0.3
 """Closing cycles over an edge: added to each count, and the count that leaves the odds unchanged."""
 
@@ -139,7 +137,7 @@ class Placements:
 def consecutive_log_evidence(evidence: Evidence) -> Floats:
     """Log-evidence of each edge (E,) if it joins consecutive views: by its prior odds, and by the cycles over it."""
     odds = evidence.prior / (1 - evidence.prior) * (evidence.support + UNSUPPORTED) / SUPPORTED
-    return np.minimum(np.log1p(odds), SURE)
+    return np.asarray(np.log1p(odds))
 
 
 def arrangement_log_evidence(evidence: Evidence, found: Fit, model: SceneModel) -> float:
