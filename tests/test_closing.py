@@ -45,6 +45,15 @@ def test_long_cycles_that_gather_noise_do_not_hide_short_ones_that_close() -> No
     assert not closes_better_than_chance(apart, np.arange(1, len(edges)))
 
 
+@pytest.mark.filterwarnings("error")
+def test_edges_that_do_not_move_among_others_are_computed_with() -> None:
+    edges = lattice(6)
+    motions = se3.exp(np.random.default_rng(0).normal(size=(len(edges), 6)))
+    motions[::2] = np.eye(4)
+    graph = ViewGraph.from_edges(np.arange(36), edges, motions)
+    assert not closes_better_than_chance(graph, np.arange(len(edges)))
+
+
 def test_odometry_and_loops_of_random_places_are_not_confirmed() -> None:
     """Loops that say "here again" of places drawn at random; the path runs straight, which is no walk at random."""
     rng = np.random.default_rng(1)

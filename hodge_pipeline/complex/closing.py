@@ -22,7 +22,10 @@ FLAT = 100.0
 """Times as large as usual along the axis that moves most are squares of motions along one that holds noise alone."""
 FAR = 1e6
 """Squared distance of an aim, in the variances of a walk, from which on that walk is no evidence."""
+LEAST_VARIANCE = 1e-200
+"""Of a walk of edges that do not move, so that what is divided by it stays finite."""
 TRIANGLES_PER_EDGE = 8
+"""Of which all but the first that holds an edge are the same evidence again."""
 
 
 def cycle_errors(loops: Loops, i_from_j: Floats, products: Floats | None = None) -> tuple[Floats, Floats]:
@@ -53,7 +56,8 @@ def closes_better_than_chance(graph: ViewGraph, kept: Ints) -> bool:
     is a test of its own: whatever the others are, a walk of the lengths of that run in random directions ends as
     near to where the rest of the cycle leads with a probability that is uniform. So minus the sum of the logarithms
     is gamma distributed although cycles share edges. Every choice of as many of the edges counts, whichever the
-    solver made: so that it chose the best makes nothing look better than it is.
+    solver made: so that it chose the best makes nothing look better than it is. Not held against it: edges which all
+    go the same way in their own frames; and rotations, or translations, that are noise alone hide what the others say.
     """
     graph, every = graph.select(kept), graph.edge_count
     loops, run = _begun_at_new_edges(short_cycles(graph.edges, graph.vertex_count, TRIANGLES_PER_EDGE))
@@ -101,8 +105,8 @@ def _log_chance(loops: Loops, run: Ints, i_from_j: Floats) -> Floats:
     aim = se3.inverse(left) @ end
     turn, shift, aim_m = se3.so3_log(i_from_j[:, :3, :3]), i_from_j[:, :3, 3], aim[:, :3, 3]
     turns, shifts = _moving(turn, se3.so3_log(aim[:, :3, :3])), _moving(shift, aim_m)
-    spread_rad2 = np.clip(walk.sums(_variance(turn[:, turns])), np.finfo(float).tiny, UNIFORM_RAD2)
-    spread_m2 = np.maximum(walk.sums(_variance(shift[:, shifts])), np.finfo(float).tiny)
+    spread_rad2 = np.clip(walk.sums(_variance(turn[:, turns])), LEAST_VARIANCE, UNIFORM_RAD2)
+    spread_m2 = np.maximum(walk.sums(_variance(shift[:, shifts])), LEAST_VARIANCE)
     square = (se3.so3_log(left[:, :3, :3])[:, turns] ** 2).sum(axis=1) / spread_rad2
     square += ((end[:, :3, 3] - aim_m)[:, shifts] ** 2).sum(axis=1) / spread_m2
     centre = np.where(run == 1, (aim_m[:, shifts] ** 2).sum(axis=1) / spread_m2, 0.0)
