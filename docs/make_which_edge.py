@@ -26,7 +26,8 @@ from hodge_pipeline.report.edge_pictures import edge_pictures
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import true_poses
 from hodge_pipeline.types import Floats, ViewGraph
-from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject, write_diagnosed
+from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject
+from hodge_pipeline.uses.diagnosis_folder import write_diagnosed
 from hodge_pipeline.uses.recipe_run import solve_again
 
 PICTURES = Path(__file__).parent / "pictures"

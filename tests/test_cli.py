@@ -29,6 +29,19 @@ def test_help_opens_with_examples_and_imports_nothing_heavy() -> None:
     assert done.stdout.index("Examples") < done.stdout.index("Commands")
 
 
+@pytest.mark.parametrize("command", ["solve", "diagnose"])
+def test_a_pose_graph_is_judged_without_what_draws(command: str, tmp_path: Path) -> None:
+    """Their import takes as long as the rest of the command."""
+    (tmp_path / "graph.g2o").write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 1 2 1 0 0 1 0 0 1 0 1\n")
+    code = (
+        f"import sys\nfrom hodge_pipeline.cli.main import app\n"
+        f"try:\n    app([{command!r}, {str(tmp_path / 'graph.g2o')!r}])\nexcept SystemExit as end:\n    assert not end.code\n"
+        "heavy = {'open3d', 'rerun', 'matplotlib'} & set(sys.modules)\nassert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 def test_the_usual_short_options_and_a_source_in_the_wrong_place() -> None:
     assert hodge("-h").stdout == hodge("--help").stdout and hodge("run", "-h").returncode == 0
     assert "may be repeated" in hodge("run", "--help").stdout and "--install-completion" in hodge("-h").stdout

@@ -33,7 +33,8 @@ from hodge_pipeline.report.edge_pictures import BLUE, ORANGE, _exaggeration, _vi
 from hodge_pipeline.report.energy import energy_rows
 from hodge_pipeline.types import Edges, PointCloud, ViewGraph
 from hodge_pipeline.types.text import number_of, with_symbols
-from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject, write_diagnosed
+from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject
+from hodge_pipeline.uses.diagnosis_folder import write_diagnosed
 from readers_data import tum_folder
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 

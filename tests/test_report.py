@@ -23,10 +23,11 @@ from hodge_pipeline.report.contents import (
     SourceSummary,
     StageRow,
 )
-from hodge_pipeline.report.run_page import document, next_commands, worst_places
+from hodge_pipeline.report.run_page import document
 from hodge_pipeline.report.summary import graph_summary, in_runs, trajectory_rows
 from hodge_pipeline.report.tables import score_tables, stages_table, worst_edges_table
 from hodge_pipeline.report.verdict import suspicions
+from hodge_pipeline.report.words import next_commands, worst_places
 from hodge_pipeline.report.write import as_json, write_report
 from hodge_pipeline.types import Edges
 from hodge_pipeline.types.notes import Note

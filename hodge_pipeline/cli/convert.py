@@ -12,7 +12,6 @@ from hodge_pipeline import registry
 from hodge_pipeline.cli.paths import keep_source
 from hodge_pipeline.cli.reader_choice import choose_reader
 from hodge_pipeline.errors import RecipeError, not_written
-from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import own_trajectory
 from hodge_pipeline.stages import Writer
 from hodge_pipeline.store.workspace import is_run_folder
@@ -51,8 +50,12 @@ def convert(
     keep_source(source, out)
     if not overwrite and out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise RecipeError(f"{out}: is there already: give another name, or --overwrite to replace it")
-    whole = is_run_folder(source) and reader is None
-    opened = Run.load(source).posed_source() if whole else choose_reader(source, reader, settings).open(source)
+    if is_run_folder(source) and reader is None:
+        from hodge_pipeline.run_folder import Run
+
+        opened = Run.load(source).posed_source()
+    else:
+        opened = choose_reader(source, reader, settings).open(source)
     opened = replace(opened, trajectory=own_trajectory(opened))
     name = to or writer_name(out, opened)
     writer: Writer = registry.load("writers", name)()

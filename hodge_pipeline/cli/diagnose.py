@@ -23,12 +23,14 @@ HEADER = ("edge", "verdict", "right", "why", "what to do")
 
 def diagnose(path: Path, out: Path | None, shown: Shown, *, top: int | None, trust: str | None) -> None:
     """Judge every edge, print the worst, and leave the rest in a folder where one is given."""
-    from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject, write_diagnosed
+    from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject
 
     with ProgressBars.of(shown) as terminal:
         with terminal.stage("diagnosis", 1):
             found = diagnose_subject(open_subject(path, trust))
         if out is not None:
+            from hodge_pipeline.uses.diagnosis_folder import write_diagnosed
+
             with terminal.stage("pictures and recording", 1):
                 write_diagnosed(out, found)
     if shown.as_json:

@@ -32,22 +32,29 @@ EVERY = 1e9
 """A gate that lets every edge pass."""
 
 
-def find_consensus(evidence: Evidence, start: Floats | None = None) -> tuple[Fit, Floats]:
-    """The solution that most edges agree with, and the probability (E,) that each edge is right, given it. Where not
-    every pair was tried, it is sought from poses `start (V, 4, 4)` too.
-    """
+def find_consensus(evidence: Evidence) -> Fit:
+    """The solution that most edges agree with."""
     grown = align(evidence)
     if evidence.exhaustive:
-        best = best_arrangement(evidence, fit(evidence, grown, TWICE))
-    else:
-        best = _mended(evidence, grown)
-        if start is not None:
-            other = fit(evidence, Alignment(np.zeros(len(start), np.int64), start), ANNEALED)
-            # by how many agree: groups of wrong loops may leave less where they have torn a graph
-            best = max(best, fit(evidence, other, (GATE,)), key=_agreement)
-    best = _one_of_each_series(best, evidence)
-    agreeing = np.sqrt(np.maximum(0.0, 1 - best.chi2 / GATE))
-    return best, _with_prior(agreeing, evidence.prior)
+        return best_arrangement(evidence, fit(evidence, grown, TWICE))
+    return _mended(evidence, grown)
+
+
+def sought_from(evidence: Evidence, best: Fit, start: Floats) -> Fit:
+    """The best solution so far, or that which poses `start (V, 4, 4)` lead to where more edges agree with it: groups of
+    wrong loops may leave less of χ² where they have torn a graph.
+    """
+    begun = Alignment(np.zeros(len(start), np.int64), start)
+    other = fit(evidence, fit(evidence, begun, ANNEALED), (GATE,))
+    return max(best, other, key=lambda found: int(found.used.sum()))
+
+
+def agreeing(evidence: Evidence, found: Fit) -> Floats:
+    """The probability (E,) that each edge is right, given the solution."""
+    clipped = np.clip(np.sqrt(np.maximum(0.0, 1 - found.chi2 / GATE)), EXTREME, 1 - EXTREME)
+    prior = evidence.prior
+    logit = np.log(clipped / (1 - clipped)) + PRIOR_SHARE * np.log(prior / (1 - prior))
+    return np.asarray(1 / (1 + np.exp(-logit)))
 
 
 def best_arrangement(evidence: Evidence, start: Fit) -> Fit:
@@ -64,7 +71,7 @@ def best_arrangement(evidence: Evidence, start: Fit) -> Fit:
     return found[int(np.argmax(values))]
 
 
-def _one_of_each_series(best: Fit, evidence: Evidence) -> Fit:
+def one_of_each_series(best: Fit, evidence: Evidence) -> Fit:
     """The solution in which, of edges that exactly the same cycles pass, the one of the largest χ² alone is left out:
     nothing tests the others without it, and without two of them a piece would come off.
     """
@@ -102,13 +109,3 @@ def _in_order(evidence: Evidence) -> Alignment:
 def _misfit(found: Fit) -> float:
     """χ² of all edges, of each no more than the gate."""
     return float(np.minimum(found.chi2, GATE).sum())
-
-
-def _agreement(found: Fit) -> int:
-    return int(found.used.sum())
-
-
-def _with_prior(agreeing: Floats, prior: Floats) -> Floats:
-    clipped = np.clip(agreeing, EXTREME, 1 - EXTREME)
-    logit = np.log(clipped / (1 - clipped)) + PRIOR_SHARE * np.log(prior / (1 - prior))
-    return np.asarray(1 / (1 + np.exp(-logit)))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from hodge_pipeline.complex.closing import cycle_errors
 from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.complex.judging import in_vertex_order
 from hodge_pipeline.complex.short_cycles import with_cycles_of
-from hodge_pipeline.diagnosis.consensus import find_consensus
+from hodge_pipeline.diagnosis.consensus import agreeing, find_consensus, one_of_each_series, sought_from
 from hodge_pipeline.diagnosis.cycles import Cycles, judge_cycles, witnesses
 from hodge_pipeline.diagnosis.evidence import Evidence, every_pair_tried, gather
 from hodge_pipeline.diagnosis.noise import Noise
@@ -26,6 +26,7 @@ from hodge_pipeline.diagnosis.result import (
     WRONG,
     Diagnosis,
 )
+from hodge_pipeline.diagnosis.robust_poses import Fit
 from hodge_pipeline.diagnosis.shared_blame import share_blame
 from hodge_pipeline.diagnosis.wording import reasons
 from hodge_pipeline.one_blas_thread import one_blas_thread
@@ -58,57 +59,79 @@ def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbo
     views was tried.
     """
     if options.trust == AUTO and every_pair_tried(graph.edges, graph.vertex_count):
-        return _by_cycles(graph, options)
+        return _ByCycles.of(graph, options).found
     backbone = find_backbone(graph, options.trust)
     if backbone is not None and not backbone.doubted:
         return backbone
-    found = _by_cycles(graph, options)
+    judged = _ByCycles.of(graph, options)
     if options.trust != AUTO or not graph.edge_count:
-        return found
-    backbone, explains_more = backbone_anyway(graph, found.kept, backbone)
+        return judged.found
+    backbone, explains_more = backbone_anyway(graph, judged.found.kept, backbone)
     if backbone is None or explains_more:
-        return backbone or found
-    if not backbone.found.confirmed:
-        return found
+        return backbone or judged.found
     # groups of wrong loops may have torn what its poses hold together
-    return _by_cycles(graph, options, backbone.world_from_cam)
+    return judged.sought_from(backbone.world_from_cam).found if backbone.found.confirmed else judged.found
 
 
-def _by_cycles(stated: ViewGraph, options: DiagnosisOptions, start: Floats | None = None) -> Diagnosis:
-    """The diagnosis that trusts no edge, sought also from poses (V, 4, 4) where `start` gives them."""
-    graph, turned = in_vertex_order(stated)
-    evidence, cycles, point = gather(graph, options)
-    there = se3.from_parts(np.eye(3), point)
-    fit, agreeing = find_consensus(evidence, None if start is None else start @ there)
-    cycles = _with_witnesses(cycles, fit.used, evidence)
-    blame = share_blame(cycles, fit, evidence)
-    unvouched = blame.unvouched & (agreeing >= LIKELIER_RIGHT)
-    untestable = evidence.in_no_listed_cycle | blame.undecided | unvouched
-    probability = np.where(untestable, np.nan, np.maximum(agreeing, blame.probability))
-    undecided = np.where(unvouched | (blame.probability > 0) | blame.undecided, blame.cycle, -1)
-    right = (probability >= CONSISTENT_FROM) & fit.used
-    wrong = probability < WRONG_BELOW
-    verdict = np.select([untestable, right, wrong], [UNTESTABLE, CONSISTENT, WRONG], SUSPECT)
-    kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
-    world_from_cam = fit.poses @ se3.inverse(there)
-    cycles = replace(cycles, loops=cycles.loops.reversed_edges(turned))
-    telling = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
-    found = Diagnosis.of(
-        stated,
-        verdict=verdict,
-        probability=probability,
-        reasons=partial(reasons, stated, cycles, verdict, telling, undecided, fit.bridge),
-        kept=kept,
-        network=Network.of(stated.edges[kept], stated.vertex_count),
-        resistance=fit.resistance,
-        cycles=cycles,
-        witnesses=telling,
-        world_from_cam=world_from_cam,
-        tested=f"cycles: {int(cycles.closes.sum())} of {len(cycles.loops)} close",
-    )
-    information = _of_noise(evidence.noise, point, graph.dimension == 2)
-    notes = (*found.notes, *evidence.noise.doubts, *free_direction_notes(stated))
-    return replace(found, information=information, notes=notes)
+@dataclass(frozen=True)
+class _ByCycles:
+    """What the cycles of a graph say, and the solution that most edges agree with, at the working point, whose frames
+    are `there (4, 4)` in those of the graph; edges that were `turned (E,)`.
+    """
+
+    stated: ViewGraph
+    turned: Bools
+    evidence: Evidence
+    cycles: Cycles
+    there: Floats
+    fit: Fit
+
+    @classmethod
+    def of(cls, stated: ViewGraph, options: DiagnosisOptions) -> _ByCycles:
+        graph, turned = in_vertex_order(stated)
+        evidence, cycles, point = gather(graph, options)
+        there = se3.from_parts(np.eye(3), point)
+        return cls(stated, turned, evidence, cycles, there, find_consensus(evidence))
+
+    def sought_from(self, world_from_cam: Floats) -> _ByCycles:
+        """The same with the solution sought from these poses (V, 4, 4) too."""
+        return replace(self, fit=sought_from(self.evidence, self.fit, world_from_cam @ self.there))
+
+    @cached_property
+    def found(self) -> Diagnosis:
+        """The diagnosis that trusts no edge."""
+        stated, evidence, there = self.stated, self.evidence, self.there
+        fit = one_of_each_series(self.fit, evidence)
+        agrees = agreeing(evidence, fit)
+        cycles = _with_witnesses(self.cycles, fit.used, evidence)
+        blame = share_blame(cycles, fit, evidence)
+        unvouched = blame.unvouched & (agrees >= LIKELIER_RIGHT)
+        untestable = evidence.in_no_listed_cycle | blame.undecided | unvouched
+        probability = np.where(untestable, np.nan, np.maximum(agrees, blame.probability))
+        undecided = np.where(unvouched | (blame.probability > 0) | blame.undecided, blame.cycle, -1)
+        right = (probability >= CONSISTENT_FROM) & fit.used
+        wrong = probability < WRONG_BELOW
+        verdict = np.select([untestable, right, wrong], [UNTESTABLE, CONSISTENT, WRONG], SUSPECT)
+        kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
+        world_from_cam = fit.poses @ se3.inverse(there)
+        cycles = replace(cycles, loops=cycles.loops.reversed_edges(self.turned))
+        telling = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
+        found = Diagnosis.of(
+            stated,
+            verdict=verdict,
+            probability=probability,
+            reasons=partial(reasons, stated, cycles, verdict, telling, undecided, fit.bridge),
+            kept=kept,
+            network=Network.of(stated.edges[kept], stated.vertex_count),
+            resistance=fit.resistance,
+            cycles=cycles,
+            witnesses=telling,
+            world_from_cam=world_from_cam,
+            tested=f"cycles: {int(cycles.closes.sum())} of {len(cycles.loops)} close",
+        )
+        information = _of_noise(evidence.noise, there, stated.dimension == 2)
+        notes = (*found.notes, *evidence.noise.doubts, *free_direction_notes(stated))
+        return replace(found, information=information, notes=notes)
 
 
 def _with_witnesses(cycles: Cycles, used: Bools, evidence: Evidence) -> Cycles:
@@ -120,10 +143,10 @@ def _with_witnesses(cycles: Cycles, used: Bools, evidence: Evidence) -> Cycles:
     return judge_cycles(loops, *cycle_errors(loops, evidence.graph.i_from_j), evidence.noise, evidence.reach_m)
 
 
-def _of_noise(noise: Noise, point: Floats, planar: bool) -> Floats:
+def _of_noise(noise: Noise, there: Floats, planar: bool) -> Floats:
     """The information (E, 6, 6) of noise at the working point, in the axes and at the origin of the frames."""
-    there = se3.adjoint(se3.from_parts(np.eye(3), -point))
-    information = there.T @ noise.information @ there
+    carried = se3.adjoint(se3.inverse(there))
+    information = carried.T @ noise.information @ carried
     if planar:
         information[:, OUT_OF_PLANE] = information[:, :, OUT_OF_PLANE] = 0
     return np.asarray(information)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.difference import floor_of
@@ -16,6 +14,9 @@ from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.document import Picture
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 from hodge_pipeline.types.text import UNKNOWN_UNIT
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DOTS_PER_INCH = 150
 SIZE = 5.0, 3.9
@@ -27,6 +28,9 @@ LINES = (":", "#D55E00"), ("-", "#0072B2")
 
 def painted(title: str, caption: str, paint: Callable[[Figure], None]) -> Picture:
     """A painted figure as a picture."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=SIZE, dpi=DOTS_PER_INCH, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     paint(figure)

@@ -17,12 +17,10 @@ from hodge_pipeline.report.write import write_report
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.store import versions
-from hodge_pipeline.store.workspace import make_folder
+from hodge_pipeline.store.workspace import SOLVED, make_folder
 from hodge_pipeline.types import Edges, Floats
 from hodge_pipeline.types.notes import notes_of
 from hodge_pipeline.types.text import counted
-
-SOLVED = "solved.json"
 
 
 def write_run_folder(folder: Path, solved: SolvedFile) -> tuple[str, ...]:

@@ -40,8 +40,8 @@ class Group:
 
     - `begin`, `end`: their positions; `neighbours (m, k)` the positions of theirs, ascending.
     - `slots`: of their blocks above the diagonal, vertex by vertex.
-    - `scatter`: sums what their elimination adds, pair by pair of neighbours, into `targets`, which count the diagonal
-      blocks first and then the others.
+    - `scatter`: sums what their elimination adds, pair a ≤ b by pair of neighbours, into `targets`, which count the
+      diagonal blocks first and then the others.
     """
 
     begin: int
@@ -52,10 +52,12 @@ class Group:
     scatter: csr_matrix
 
     @cached_property
-    def pairs(self) -> list[tuple[int, int]]:
-        """Pairs a ≤ b of neighbours in the order of the scatter's columns."""
+    def blocks(self) -> Ints:
+        """The target (k, k, m) of each pair of neighbours, the smaller first; no other is set."""
         k = self.neighbours.shape[1]
-        return [(a, b) for a in range(k) for b in range(a, k)]
+        out = np.zeros((k, k, len(self.neighbours)), np.int64)
+        out[np.triu_indices(k)] = self.targets[self.scatter.tocsc().indices].reshape(-1, len(self.neighbours))
+        return out
 
     @cached_property
     def gather(self) -> csr_matrix:
@@ -291,12 +293,17 @@ class BlockFactor:
         if core < self.plan.size:
             x[core:] = self.solve_core(x[core:].reshape(-1, columns)).reshape(-1, size, columns)
         for group in reversed(self.plan.groups):
-            own = np.matmul(self.pivots[group.begin : group.end], x[group.begin : group.end])
-            for a in range(group.neighbours.shape[1]):
-                block = self.rows[group.slots][a :: group.neighbours.shape[1]]
-                own -= np.matmul(block, x[group.neighbours[:, a]])
-            x[group.begin : group.end] = own
+            count, k = group.neighbours.shape
+            wide = side_by_side(self.rows[group.slots].reshape(count, k, size, size))
+            own = self.pivots[group.begin : group.end] @ x[group.begin : group.end]
+            x[group.begin : group.end] = own - wide @ x[group.neighbours].reshape(count, k * size, columns)
         return np.asarray(x.reshape(rhs.shape), float)
+
+
+def side_by_side(blocks: Floats) -> Floats:
+    """Blocks (m, k, s, s) as one (m, s, k · s) of each vertex: one product in place of k."""
+    count, k, size, _ = blocks.shape
+    return blocks.transpose(0, 2, 1, 3).reshape(count, size, k * size)
 
 
 def eliminate(
@@ -346,15 +353,18 @@ def _eliminate_group(group: Group, diagonal: Floats, rows: Floats, flat: tuple[F
     if not k:
         return
     blocks = rows[group.slots].reshape(count, k, size, size)
-    divided = np.matmul(pivots[:, None], blocks)
-    added = np.empty((len(group.pairs), count, size, size), rows.dtype)
-    for number, (a, b) in enumerate(group.pairs):
-        np.matmul(blocks[:, a].transpose(0, 2, 1), divided[:, b], out=added[number])
+    wide = side_by_side(blocks)
+    divided = pivots @ wide
+    added, row = np.empty((k * (k + 1) // 2, count, size, size), rows.dtype), 0
+    for a in range(k):
+        with_later = wide[:, :, a * size : (a + 1) * size].transpose(0, 2, 1) @ divided[:, :, a * size :]
+        added[row : row + k - a] = with_later.reshape(count, size, k - a, size).transpose(2, 0, 1, 3)
+        row += k - a
     total = group.scatter @ added.reshape(-1, size * size)
     on = int(np.searchsorted(group.targets, len(diagonal)))
     flat[0][group.targets[:on]] -= total[:on]
     flat[1][group.targets[on:] - len(diagonal)] -= total[on:]
-    blocks[:] = divided
+    blocks[:] = divided.reshape(count, size, k, size).transpose(0, 2, 1, 3)
 
 
 def _core_matrix(plan: Elimination, diagonal: Floats, rows: Floats) -> csc_matrix:

@@ -23,6 +23,8 @@ _DRAFT = re.compile(r"\.[^.].*\.(csv|g2o|html|json|kitti|npz|ply|rrd|tum|txt|yam
 _DRAFT_FOLDER = re.compile(r"\.(recording-|sparse\.)[a-z0-9_]{8}")
 """What `output_files` and the recording call a file or folder that is not whole yet."""
 """In each stage of the layout before `Store`."""
+SOLVED = "solved.json"
+"""In the run folder of a solved pose-graph file."""
 RUN, REFINEMENT = "stages", "refinement"
 """The folder of the stages of a run, and of the refinement of a model."""
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, None)

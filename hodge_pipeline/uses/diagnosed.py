@@ -1,42 +1,36 @@
-"""A run or a pose-graph file diagnosed: what is judged, and what is left of it in a folder."""
+"""A run or a pose-graph file diagnosed: what is judged, and what follows from it."""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hodge_pipeline import registry
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG, Diagnosis
+from hodge_pipeline.diagnosis.result import WRONG, Diagnosis
 from hodge_pipeline.pairs.edits import EDGES, joining, pair_names, read_history
 from hodge_pipeline.recipe.round_options import SuggestionOptions
-from hodge_pipeline.refine.pose_graph import read_graph, vertex_trajectory
+from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.report.advice import advice, in_unit, ranked
-from hodge_pipeline.report.contents import Report
-from hodge_pipeline.report.diagnosis_page import PageContents, document, sentence
-from hodge_pipeline.report.diagnosis_plots import draw, side_by_side
-from hodge_pipeline.report.document import render
-from hodge_pipeline.report.edge_pictures import edge_pictures
+from hodge_pipeline.report.diagnosis_page import sentence
 from hodge_pipeline.report.energy import EnergyRow, energy_rows
-from hodge_pipeline.report.solved import SOLVED
 from hodge_pipeline.report.verdict import NOTHING_MOVED_M
 from hodge_pipeline.rounds.suggestions import Suggestions, suggest_pairs
-from hodge_pipeline.run_folder import Run
 from hodge_pipeline.solvers.backbone.trust import AUTO
-from hodge_pipeline.start.unordered.pieces import laid_apart
-from hodge_pipeline.store import artifacts
-from hodge_pipeline.store.edge_table import read_edges, write_edges
-from hodge_pipeline.store.workspace import is_run_folder, make_folder
-from hodge_pipeline.types import Bools, CloudSet, Edges, Frame, Ints, Source, ViewGraph
+from hodge_pipeline.store.edge_table import read_edges
+from hodge_pipeline.store.workspace import SOLVED, is_run_folder
+from hodge_pipeline.types import Bools, CloudSet, Edges, Frame, Ints, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, IGNORED, USED
 from hodge_pipeline.types.text import command
 
-PICTURED, LEAST_PICTURED = 6, 2
+if TYPE_CHECKING:
+    from hodge_pipeline.report.contents import Report
+    from hodge_pipeline.run_folder import Run
+
 SUGGESTED, REGISTERED = 12, 6
 """Pairs that are ranked, and those that a command to type names."""
 COMMANDED = 3
@@ -80,7 +74,12 @@ def open_subject(path: Path, trust: str | None = None) -> Subject:
 
     `trust`: which edges are a backbone, in place of what the run's recipe says.
     """
-    subject = _run_subject(path, Run.load(path)) if is_run_folder(path) else _file_subject(path)
+    if is_run_folder(path):
+        from hodge_pipeline.run_folder import Run
+
+        subject = _run_subject(path, Run.load(path))
+    else:
+        subject = _file_subject(path)
     if trust is None:
         return subject
     return replace(subject, options=replace(subject.options, trust=trust), harmless="")
@@ -189,6 +188,8 @@ def _overlapping(subject: Subject, found: Diagnosis) -> Ints | None:
     """The pairs of a run that see something in common at the robust poses."""
     if subject.clouds is None or not subject.frames:
         return None
+    from hodge_pipeline.start.unordered.pieces import laid_apart
+
     poses = laid_apart(found.piece, found.world_from_cam, subject.clouds)
     return subject.suggestions.among.propose(subject.frames, subject.clouds, poses).pairs
 
@@ -231,46 +232,3 @@ def _commands(subject: Subject, found: Diagnosis, suggestions: Suggestions) -> t
     if not wrong:
         edit = "--register", ",".join(pair_names(subject.graph.vertex_ids, useful))
     return command("hodge", "edit", subject.path, *edit), command("hodge", "solve", subject.path)
-
-
-def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) -> None:
-    """`edges.csv`, `poses.tum`, `diagnosis.html` and `diagnosis.rrd` in a folder, made if it is not there."""
-    make_folder(out)
-    subject, found = diagnosed.subject, diagnosed.diagnosis
-    residuals = {"residual_m": found.residual_m, "residual_rad": np.deg2rad(found.residual_deg)}
-    edges, names = replace(found.put_into(subject.edges), **residuals), subject.graph.vertex_ids
-    write_edges(out / "edges.csv", edges, names, has_metres=subject.has_metres)
-    _write_poses(out / "poses.tum", subject, found)
-    artifacts.write_text(out / "diagnosis.html", render(document(_page(diagnosed))))
-    if recording:
-        from hodge_pipeline.recording.diagnosis_file import write_diagnosis
-
-        identity = hashlib.sha256(np.ascontiguousarray(found.world_from_cam).tobytes()).hexdigest()[:32]
-        placed = side_by_side(found.world_from_cam, found.piece)
-        write_diagnosis(out / "diagnosis.rrd", identity, subject.graph, placed, found)
-
-
-def _write_poses(path: Path, subject: Subject, found: Diagnosis) -> None:
-    """The robust poses by the numbers of their vertices."""
-    trajectory = vertex_trajectory(subject.graph, found.world_from_cam)
-    registry.load("writers", "tum")().write(path, Source(subject.name, subject.path, trajectory=trajectory))
-
-
-def _page(diagnosed: Diagnosed) -> PageContents:
-    subject, found = diagnosed.subject, diagnosed.diagnosis
-    rows = diagnosed.rows[: max(LEAST_PICTURED, min(PICTURED, int((found.verdict != CONSISTENT).sum())))]
-    pictures = edge_pictures(subject.graph, found, rows, subject.frames, subject.clouds, has_metres=subject.has_metres)
-    return PageContents(
-        title=subject.name,
-        path=str(subject.path),
-        graph=subject.graph,
-        diagnosis=found,
-        advice=diagnosed.advice,
-        energy=diagnosed.energy,
-        plots=draw(subject.graph, found, diagnosed.energy, subject.has_metres),
-        edges=pictures,
-        suggestions=diagnosed.suggestions,
-        commands=diagnosed.commands,
-        notes=diagnosed.notes,
-        has_metres=subject.has_metres,
-    )

@@ -287,17 +287,17 @@ class Fit:
         return np.asarray(linear.chain.exp(out) @ linear.poses)
 
 
-LEAST_WON, HALVINGS = 1e-3, 4
-"""Of χ²: a step that wins less moves nothing by more than a thirtieth of its standard deviation."""
+LEAST_WON, HALVINGS = 0.1, 4
+"""Of χ²: a step that wins less moves nothing by more than a third of its standard deviation."""
 
 
-def settled(fit: Fit, steps: int, least_won: float = LEAST_WON) -> Fit:
+def settled(fit: Fit, steps: int) -> Fit:
     """The fit at the poses of least cost with the active loops, or after as many steps: until one would win less of χ²
-    than this. A step that wins nothing is halved.
+    than `LEAST_WON`. A step that wins nothing is halved.
     """
     for _ in range(steps if len(fit.reduced.active) else 0):
         (moves, won), before = fit.moves(), fit.cost
-        if won < least_won:
+        if won < LEAST_WON:
             break
         for _ in range(HALVINGS):
             tried = replace(fit, linear=linearise(fit.linear.chain, fit.moved(moves)))

@@ -33,8 +33,6 @@ MOST_TRIED = 3
 """Places that are left out on trial each time, and groups of unused loops that may be added: limits on cost."""
 CLEARLY = float(np.log(20.0))
 """Log-odds that a change must win."""
-LEAST_WON = 0.1
-"""Of χ², for which poses are improved where places are compared."""
 ADJACENT = 2.0
 """Places between places that follow each other: a corridor that is mistaken for another is one testimony."""
 LONGEST = 5.0
@@ -141,7 +139,7 @@ class Places:
 
     def arranged(self, right: Bools, linear: Linear) -> Arrangement:
         """These places (K,) taken for right, at the poses that are reached from some others."""
-        fit = settled(Fit(thinned(self.start.chain, self.loop[right]), linear), MOST_STEPS, LEAST_WON)
+        fit = settled(Fit(thinned(self.start.chain, self.loop[right]), linear), MOST_STEPS)
         active = np.searchsorted(self.loop, fit.reduced.active)
         # of what is expected beforehand, that of one counts
         prior = max(len(active) - 1, 0) * float(np.log(MISTAKEN_PLACES)) - float(self.rivals(right)[active].sum())

@@ -16,6 +16,7 @@ from hodge_pipeline.solvers.elimination import (
     Ordering,
     eliminate_blocks,
     plan_elimination,
+    side_by_side,
 )
 from hodge_pipeline.types import Floats, Ints
 
@@ -149,14 +150,13 @@ class Factored:
         if not k:
             return
         p = pivots.shape[-1]
-        divided = self.blocks.rows[group.slots].reshape(count, k, p, p)
         between = np.empty((count, k, k, p, p))
-        for a in range(k):
-            between[:, a, a] = diagonal[group.neighbours[:, a]]
-            for b in range(a + 1, k):
-                block = rows[np.searchsorted(plan.keys, group.neighbours[:, a] * plan.size + group.neighbours[:, b])]
-                between[:, a, b], between[:, b, a] = block, np.swapaxes(block, 1, 2)
-        wide = divided.transpose(0, 2, 1, 3).reshape(count, p, k * p)
+        each = np.arange(k)
+        between[:, each, each] = diagonal[group.neighbours]
+        a, b = np.triu_indices(k, 1)
+        off = rows[group.blocks[a, b].T - plan.size]
+        between[:, a, b], between[:, b, a] = off, np.swapaxes(off, 2, 3)
+        wide = side_by_side(self.blocks.rows[group.slots].reshape(count, k, p, p))
         across = -wide @ between.transpose(0, 1, 3, 2, 4).reshape(count, k * p, k * p)
         diagonal[group.begin : group.end] -= across @ np.swapaxes(wide, 1, 2)
         rows[group.slots] = across.reshape(count, p, k, p).transpose(0, 2, 1, 3).reshape(count * k, p, p)

@@ -1,0 +1,56 @@
+"""What a report's page and the terminal both say: what a run took, where it is worst, and what to type next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from hodge_pipeline.report.contents import Report
+from hodge_pipeline.report.painting import has_truth, offsets
+from hodge_pipeline.report.tables import peak_mb
+from hodge_pipeline.report.verdict import capital
+from hodge_pipeline.types.text import command
+
+
+def peak(report: Report) -> str:
+    """`, at most 800 MB`; nothing where memory was not measured."""
+    memory = peak_mb(report)
+    return f", at most {memory:.0f} MB" if np.isfinite(memory) else ""
+
+
+def worst_places(report: Report) -> Iterator[str]:
+    """The frame and the edge that are worst, a line each, where they were measured."""
+    errors = offsets(report).get(report.after)
+    if errors is not None and len(report.pictures.names) == len(errors):
+        size = np.linalg.norm(errors, axis=1)
+        row = int(np.nanargmax(size))
+        name, off = f"{report.source.vertex} {report.pictures.names[row]}", report.length(float(size[row]))
+        what = f"lies {off} off the truth" if has_truth(report) else f"was moved by {off}"
+        where = "in the refinement, which is not kept, " if report.shows_rejected else ""
+        yield capital(f"{where}{name} {what}, more than any other.")
+    used = [edge for edge in report.worst_edges if edge.weight > 0]
+    if used:
+        off = f"{report.length(used[0].residual_m)} and {used[0].residual_deg:.2g}°"
+        verdict = f" ({used[0].verdict})" if used[0].verdict else ""
+        yield f"Of the edges that count, {used[0].i}–{used[0].j}{verdict} fits least: it is {off} off the result."
+
+
+def next_commands(report: Report, folder: str) -> Iterator[str]:
+    """What to type next, each with why."""
+    yield from ("# see it in 3-D, in the browser", command("hodge", "view", folder, "--web"))
+    if report.verdicts_of_concern or len(report.pieces) > 1:
+        yield from (
+            "# which edges are wrong, and what to do",
+            command("hodge", "diagnose", folder, "--out", f"{folder}-why"),
+        )
+    if report.wrong_edges is not None and report.wrong_edges.matters(report.scale):
+        yield "# leave the wrong edges out; solve and fuse again"
+        yield from (command("hodge", "edit", folder, "--disable", "wrong"), command("hodge", "solve", folder))
+
+
+def duration(seconds: float) -> str:
+    """A time with a unit that suits its size."""
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
