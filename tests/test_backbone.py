@@ -60,11 +60,14 @@ def test_selected_inversion_is_the_dense_inverse() -> None:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_the_reduced_chain_ends_at_the_minimum_over_all_poses(dimension: int) -> None:
+def test_the_reduced_chain_ends_at_the_minimum_over_all_poses(
+    monkeypatch: pytest.MonkeyPatch, dimension: int
+) -> None:
+    monkeypatch.setattr(fit, "LEAST_WON", 1e-12)
     graph = drive(dimension=dimension, wrong=0.0, loops=30).graph
     chain = chain_of(graph)
     bare = Fit(Reduced.of(chain, np.arange(len(chain.loop_edge))), linearise(chain, chain.poses))
-    found = settled(bare, 30, 1e-12)
+    found = settled(bare, 30)
     assert found.cost < bare.cost / 10
     exact = solve(graph)
     again = solve(graph, start=found.linear.poses[np.argsort(chain.order)], initial="given")
@@ -81,13 +84,14 @@ def test_an_odometry_that_turns_wrongly_by_six_degrees_a_step_is_solved(monkeypa
     assert made.error_m(found.world_from_cam) < 0.3
 
 
-def test_left_out_residuals_are_those_of_a_solve_without_the_loop() -> None:
+def test_left_out_residuals_are_those_of_a_solve_without_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit, "LEAST_WON", 1e-12)
     chain = chain_of(drive(wrong=0.0, loops=12).graph)
-    found = settled(Fit(Reduced.of(chain, np.arange(12)), linearise(chain, chain.poses)), 30, 1e-12)
+    found = settled(Fit(Reduced.of(chain, np.arange(12)), linearise(chain, chain.poses)), 30)
     without = left_out(found)[0]
     for row in (0, 5, 11):
         others = Reduced.of(chain, np.delete(np.arange(12), row))
-        actual = settled(Fit(others, found.linear), 30, 1e-12).linear.loops[0][row]
+        actual = settled(Fit(others, found.linear), 30).linear.loops[0][row]
         np.testing.assert_allclose(without[row], actual, atol=0.03 * np.abs(actual).max() + 2e-3)
 
 

@@ -287,8 +287,8 @@ class Fit:
         return np.asarray(linear.chain.exp(out) @ linear.poses)
 
 
-LEAST_WON, HALVINGS = 0.1, 4
-"""Of χ²: a step that wins less moves nothing by more than a third of its standard deviation."""
+LEAST_WON, HALVINGS = 0.01, 4
+"""Of χ²: a step that wins less moves nothing by more than a tenth of its standard deviation."""
 
 
 def settled(fit: Fit, steps: int) -> Fit:
