@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -193,7 +193,11 @@ class Run:
     @property
     def recipe(self) -> Recipe:
         """The recipe in the folder, without the options of another version (`options_left_out`)."""
-        return recipe_of_run(self.folder / RECIPE_FILE)[0]
+        return self._known[0]
+
+    @cached_property
+    def _known(self) -> tuple[Recipe, tuple[str, ...]]:
+        return recipe_of_run(self.folder / RECIPE_FILE)
 
     @property
     def scaled_recipe(self) -> Recipe:
@@ -205,7 +209,7 @@ class Run:
     @property
     def options_left_out(self) -> tuple[Note, ...]:
         """What is in the folder's recipe and unknown here, a note each: only running it again needs it."""
-        return tuple(Note("option unknown", detail=line) for line in recipe_of_run(self.folder / RECIPE_FILE)[1])
+        return tuple(Note("option unknown", detail=line) for line in self._known[1])
 
     def key_frames_with_images(self) -> tuple[Sequence[Frame], tuple[Note, ...]]:
         """The key frames as their source has them, none where it has gone or has others by now, and a note why."""

@@ -58,7 +58,7 @@ def run_folder(spoiled_run: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
-    found = start_browser()
+    found = start_browser(1500, 1000, "--force-device-scale-factor=0.5")
     yield found
     found.quit()
 
