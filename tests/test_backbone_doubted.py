@@ -69,10 +69,9 @@ def test_a_lattice_whose_odometry_is_wrong_at_many_steps_needs_none() -> None:
     assert not found.kept[wrong].any()
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_fifth_of_the_edges_of_a_lattice_are_wrong(seed: int) -> None:
+def test_a_fifth_of_the_edges_of_a_lattice_are_wrong() -> None:
     """Rows walked to and fro, each joined to the next: growing alone ended 15 m off."""
-    rng, k = np.random.default_rng([seed, 200, 20]), np.arange(200)
+    rng, k = np.random.default_rng([0, 200, 20]), np.arange(200)
     row, along = k // 20, k % 20
     back = row % 2 == 1
     place = np.stack([np.where(back, 19 - along, along), row, 0 * k], axis=1).astype(float)

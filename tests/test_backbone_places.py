@@ -73,10 +73,10 @@ def test_a_second_lap_over_the_first_says_more_than_one_mistaken_corridor(seed: 
     assert made.error_m(found.world_from_cam) < 1.0 < 30 < made.error_m(made.odometry())
 
 
-LATTICES = {"triangles": (1, 30, 31), "squares": (1, 30), "squares, wide": (1, 50)}
+LATTICES = {"triangles": (1, 30, 31), "squares, wide": (1, 50)}
 
 
-@pytest.mark.parametrize(("spans", "share"), [("squares", 0.02), ("triangles", 0.1), ("squares, wide", 0.1)])
+@pytest.mark.parametrize(("spans", "share"), [("triangles", 0.1), ("squares, wide", 0.1)])
 def test_a_lattice_with_wrong_steps_is_judged_by_its_cycles(spans: str, share: float) -> None:
     """A backbone kept up to half of its wrong edges, lost half of the right ones and was 4 to 16 m off."""
     whole, truth = rings(200, LATTICES[spans][1])

@@ -34,8 +34,8 @@ def test_a_pose_graph_is_judged_without_what_draws(command: str, tmp_path: Path)
     """Their import takes as long as the rest of the command."""
     (tmp_path / "graph.g2o").write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 1 2 1 0 0 1 0 0 1 0 1\n")
     code = (
-        f"import sys\nfrom hodge_pipeline.cli.main import app\n"
-        f"try:\n    app([{command!r}, {str(tmp_path / 'graph.g2o')!r}])\nexcept SystemExit as end:\n    assert not end.code\n"
+        f"import sys\nfrom hodge_pipeline.cli.main import app\ntry:\n"
+        f"    app([{command!r}, {str(tmp_path / 'graph.g2o')!r}])\nexcept SystemExit as end:\n    assert not end.code\n"
         "heavy = {'open3d', 'rerun', 'matplotlib'} & set(sys.modules)\nassert not heavy, heavy\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

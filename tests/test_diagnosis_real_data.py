@@ -63,16 +63,11 @@ def test_hardly_an_edge_of_a_sound_pose_graph_is_blamed(data_dir: Path, name: st
     assert (found.verdict == UNTESTABLE).mean() < 0.03
 
 
-@pytest.mark.parametrize(
-    ("name", "vertices", "share", "most_blamed"),
-    [("gtsam/w20000.txt", 4000, 0.1, 0.015), ("sesync/cubicle.g2o", 5750, 0.3, 0.05)],
-)
-def test_wrong_loops_do_not_put_the_blame_on_what_drifted(
-    data_dir: Path, name: str, vertices: int, share: float, most_blamed: float
-) -> None:
-    """The first `vertices` of a path are long enough to drift by more than what is wrong."""
-    whole = read_graph(data_dir / "pose_graphs" / name).graph
+def test_wrong_loops_do_not_put_the_blame_on_what_drifted(data_dir: Path) -> None:
+    """The first vertices of a path are long enough to drift by more than what is wrong."""
+    whole = read_graph(data_dir / "pose_graphs/gtsam/w20000.txt").graph
     assert whole is not None
+    vertices = 4000
     rows = (whole.edges < vertices).all(axis=1)
     graph = ViewGraph.from_edges(
         whole.vertex_ids[:vertices], whole.edges[rows], whole.i_from_j[rows], whole.information[rows],
@@ -80,7 +75,7 @@ def test_wrong_loops_do_not_put_the_blame_on_what_drifted(
     )  # fmt: skip
     loops = np.flatnonzero(np.abs(graph.edges[:, 1] - graph.edges[:, 0]) > 1)
     rng = np.random.default_rng(1)
-    bad = rng.choice(loops, int(share * len(loops)), replace=False)
+    bad = rng.choice(loops, len(loops) // 10, replace=False)
     off = np.zeros((len(bad), 6))
     off[:, 2:5] = rng.normal(size=(len(bad), 3)) * [1, 5, 5]
     measured = graph.i_from_j.copy()
@@ -88,7 +83,7 @@ def test_wrong_loops_do_not_put_the_blame_on_what_drifted(
     found = diagnose(replace(graph, i_from_j=measured))
     right = np.ones(graph.edge_count, bool)
     right[bad] = False
-    assert (~found.kept[right]).mean() <= most_blamed
+    assert (~found.kept[right]).mean() <= 0.015
     assert found.kept[~right].mean() <= 0.1  # some are changed by little, some in no cycle
 
 
