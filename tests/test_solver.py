@@ -130,3 +130,10 @@ def test_projection_gives_the_nearest_rotation(seed, size):
     u, _, vt = np.linalg.svd(matrices)
     u[:, :, -1] *= np.sign(np.linalg.det(u @ vt))[:, None]
     np.testing.assert_allclose(project(matrices), u @ vt, atol=1e-7)
+
+
+def test_a_warm_start_that_takes_long_leaves_steps_for_the_objective_asked_for(data_dir):
+    graph = as_sesync_reads_it(data_dir, "sphere2500")
+    far = se3.exp(np.random.default_rng(0).normal(size=(graph.vertex_count, 6)) * np.repeat([2.0, 50.0], 3))
+    found = solve(graph, start=far, initial="given", max_iterations=6)
+    assert found.stopped_by == "iteration limit reached" and found.metrics["iterations"] == 3

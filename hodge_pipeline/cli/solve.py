@@ -98,7 +98,7 @@ def solve(
         print_json({"source": str(solved.source.path), "out": None if out is None else str(out), **summary})
     elif not shown.quiet:
         print("\n".join(_lines(solved, summary, out, run_folder, verbose=shown.verbose)))
-    _check(summary)
+    _check(summary, options.initial)
 
 
 def _writer(out: Path, source: Source) -> str:
@@ -136,7 +136,7 @@ def _lines(
     return [*lines, f"{'next':<{LABEL}}{command('hodge', 'diagnose', run_folder or solved.source.path)}"]
 
 
-def _check(summary: dict[str, Any]) -> None:
+def _check(summary: dict[str, Any], start: InitialName) -> None:
     if summary["certified"] is False:
         raise CheckError("the result is not proven to be the global minimum: see the notes; try --start chordal")
     if summary["confirmed"] is False:
@@ -145,6 +145,9 @@ def _check(summary: dict[str, Any]) -> None:
             "chance; add edges between the same views, or see which are wrong with hodge diagnose"
         )
     if not summary["converged"]:
-        late = summary["stopped_by"] == TIME_LIMIT_REACHED
-        remedy = "raise --time-limit" if late else "if edges may be wrong, hodge diagnose names them, or add --robust"
+        remedy = "if edges may be wrong, hodge diagnose names them, or add --robust"
+        if summary["stopped_by"] == TIME_LIMIT_REACHED:
+            remedy = "raise --time-limit"
+        elif start == "given":
+            remedy = f"leave out --start given, since the edges alone may lead to better ones; {remedy}"
         raise CheckError(f"the solver stopped before it converged, with the best poses so far: {remedy}")

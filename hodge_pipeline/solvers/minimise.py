@@ -73,8 +73,9 @@ def _minimum(
     if full and (near_minimum or full_at_once(setup.problem)):
         objective = full_objective(setup)
         return descend(objective, objective.at(*begin), limits, setup.rounding, watch)
-    loose = replace(limits, relative_tolerance=max(limits.relative_tolerance, WARM_START_TOLERANCE))
-    warm = descend_isotropic(setup.problem, begin, loose if full else limits, setup.rounding, watch)
+    loose = max(limits.relative_tolerance, WARM_START_TOLERANCE)
+    warming = Limits(limits.max_iterations // 2, loose, limits.deadline_s) if full else limits
+    warm = descend_isotropic(setup.problem, begin, warming, setup.rounding, watch)
     if not full:
         return warm
     point, steps, cg_steps = (warm.point.rotations, warm.point.translations), len(warm.costs) - 1, warm.cg_steps
