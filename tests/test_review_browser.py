@@ -306,9 +306,11 @@ def test_a_server_that_is_killed_loses_no_decision(browser: Any, run_folder: Pat
 
 
 def test_without_webgl_there_is_a_line_and_every_decision(review: Review, run_folder: Path) -> None:
-    bare = start_browser(1500, 1000, "--disable-3d-apis")
+    bare = start_browser(1000, 700, "--disable-3d-apis")
     try:
         bare.get(review.address)
+        script = "return ['main', 'aside'].map(name => document.querySelector(name).getBoundingClientRect().width)"
+        assert min(bare.execute_script(script)) > 950, "in a small window one is above the other"
         page = Page.__new__(Page)
         page.browser, page.review = bare, review
         page.settled()
