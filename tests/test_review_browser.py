@@ -58,7 +58,7 @@ def run_folder(spoiled_run: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
-    found = start_browser(1500, 1000, "--force-device-scale-factor=0.5")
+    found = start_browser(1000, 800)
     yield found
     found.quit()
 
