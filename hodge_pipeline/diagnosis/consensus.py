@@ -9,12 +9,9 @@ fall out.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import Alignment, align
 from hodge_pipeline.diagnosis.placement import arrangement_log_evidence
@@ -69,19 +66,6 @@ def best_arrangement(evidence: Evidence, start: Fit) -> Fit:
     models = [learn_scene_model(evidence, one) for one in found]
     values = [sum(arrangement_log_evidence(evidence, one, model) for model in models) for one in found]
     return found[int(np.argmax(values))]
-
-
-def one_of_each_series(best: Fit, evidence: Evidence) -> Fit:
-    """The solution in which, of edges that exactly the same cycles pass, the one of the largest χ² alone is left out:
-    nothing tests the others without it, and without two of them a piece would come off.
-    """
-    classes = series_classes(evidence.graph.edges, evidence.graph.vertex_count)
-    out = np.flatnonzero(~best.used & (classes >= 0))
-    out = out[np.lexsort((-best.chi2[out], classes[out]))]
-    spared = out[1:][np.diff(classes[out]) == 0]
-    chi2, used = best.chi2.copy(), best.used.copy()
-    chi2[spared], used[spared] = 0.0, True
-    return replace(best, chi2=chi2, used=used)
 
 
 def _mended(evidence: Evidence, grown: Alignment) -> Fit:

@@ -13,7 +13,7 @@ from hodge_pipeline.complex.closing import cycle_errors
 from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.complex.judging import in_vertex_order
 from hodge_pipeline.complex.short_cycles import with_cycles_of
-from hodge_pipeline.diagnosis.consensus import agreeing, find_consensus, one_of_each_series, sought_from
+from hodge_pipeline.diagnosis.consensus import agreeing, find_consensus, sought_from
 from hodge_pipeline.diagnosis.cycles import Cycles, judge_cycles, witnesses
 from hodge_pipeline.diagnosis.evidence import Evidence, every_pair_tried, gather
 from hodge_pipeline.diagnosis.noise import Noise
@@ -100,8 +100,7 @@ class _ByCycles:
     @cached_property
     def found(self) -> Diagnosis:
         """The diagnosis that trusts no edge."""
-        stated, evidence, there = self.stated, self.evidence, self.there
-        fit = one_of_each_series(self.fit, evidence)
+        stated, evidence, fit, there = self.stated, self.evidence, self.fit, self.there
         agrees = agreeing(evidence, fit)
         cycles = _with_witnesses(self.cycles, fit.used, evidence)
         blame = share_blame(cycles, fit, evidence)
