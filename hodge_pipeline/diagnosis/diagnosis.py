@@ -88,6 +88,7 @@ class _ByCycles:
 
     @classmethod
     def of(cls, stated: ViewGraph, options: DiagnosisOptions) -> _ByCycles:
+        """What they say of this graph."""
         graph, turned = in_vertex_order(stated)
         evidence, cycles, point = gather(graph, options)
         there = se3.from_parts(np.eye(3), point)

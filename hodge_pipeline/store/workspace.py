@@ -22,7 +22,6 @@ RECIPE_FILE, LOCK_FILE = "recipe.yaml", ".lock"
 _DRAFT = re.compile(r"\.[^.].*\.(csv|g2o|html|json|kitti|npz|ply|rrd|tum|txt|yaml)\.[0-9]+\.draft")
 _DRAFT_FOLDER = re.compile(r"\.(recording-|sparse\.)[a-z0-9_]{8}")
 """What `output_files` and the recording call a file or folder that is not whole yet."""
-"""In each stage of the layout before `Store`."""
 SOLVED = "solved.json"
 """In the run folder of a solved pose-graph file."""
 RUN, REFINEMENT = "stages", "refinement"
