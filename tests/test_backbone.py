@@ -167,17 +167,17 @@ def test_a_covariance_that_sums_left_indefinite_has_a_root() -> None:
     np.testing.assert_allclose(found @ np.swapaxes(found, 1, 2), covariance, atol=2e-3)
 
 
-def test_random_motions_between_places_seen_again_are_never_worse(data_dir: Path) -> None:
+def test_random_motions_between_places_seen_again_are_not_used(data_dir: Path) -> None:
     graph = read_graph(data_dir / "pose_graphs/sesync/intel.g2o").graph
     assert graph is not None
     loops = np.flatnonzero(np.diff(graph.edges, axis=1)[:, 0] != 1)
     truth = find_backbone(graph, "sequential")
     assert truth is not None
-    motion, size = graph.i_from_j.copy(), [0.0, 0.0, 0.7, 0.7, 0.7, 0.0]
+    motion, size = graph.i_from_j.copy(), [0.0, 0.0, 0.7, 1.5, 1.5, 0.0]
     motion[loops] = se3.exp(np.random.default_rng(0).normal(size=(len(loops), 6)) * size)
     made = Drive(replace(graph, i_from_j=motion), truth.world_from_cam, np.ones(graph.edge_count, bool))
     backbone = find_backbone(made.graph)
-    assert backbone is not None  # of which some are right by chance here and there
+    assert backbone is not None and not backbone.used[loops].any()
     assert made.error_m(backbone.world_from_cam) <= 1.02 * made.error_m(made.odometry())
 
 
