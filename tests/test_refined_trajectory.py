@@ -1,5 +1,6 @@
 """Refinement from Python: arrays and Open3D objects in and out; the correction spread; the file forms."""
 
+import codecs
 import json
 from pathlib import Path
 
@@ -200,6 +201,22 @@ def test_only_the_poses_change_in_a_file(name: str, tmp_path: Path) -> None:
         line.split()[0].split(",")[0] if line.split() else "" for line in written.read_text().splitlines()
     ][: len(kept) if name != "kept.log" else 1] == (kept if name != "kept.log" else kept[:1])
     assert name != "data.csv" or written.read_text().splitlines()[1].endswith(",.5")
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("head", [codecs.BOM_UTF8 + "# von Jörg\r\n".encode(), b"# J\xf6rg \x85 1 0 0 1\r\n\r\n"])
+def test_every_byte_beside_the_poses_stays(name: str, head: bytes, tmp_path: Path) -> None:
+    rewriter, text = FILES[name]
+    body = text.replace("\n", "\r\n").encode()
+    (tmp_path / name).write_bytes(head + body)
+    trajectory = guess_reader(tmp_path / name).open(tmp_path / name).trajectory
+    assert trajectory is not None and len(trajectory) == 2
+    written = rewriter().rewrite(tmp_path, tmp_path / name, trajectory)
+    contents = written.read_bytes()
+    assert contents.startswith(head) and contents.count(b"\r\n") == (head + body).count(b"\n") == contents.count(b"\n")
+    again = guess_reader(written).open(written).trajectory
+    assert again is not None
+    np.testing.assert_array_equal(again.world_from_cam, trajectory.world_from_cam)
 
 
 def test_seven_scenes_poses_become_a_folder(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import shutil
+from codecs import BOM_UTF8
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,13 +17,14 @@ from hodge_adapters.json_files import read_json, write_json
 from hodge_adapters.nerfstudio import opengl_matrix, transforms_file
 from hodge_adapters.open3d_json import Open3dReader, Open3dTrajectoryWriter
 from hodge_adapters.seven_scenes.files import FRAME_FILE, sequence_folders
-from hodge_adapters.text_rows import read_text, to_floats, write_text_atomically
+from hodge_adapters.text_rows import reading, to_floats, write_bytes_atomically, write_text_atomically
 from hodge_adapters.trajectories.euroc import NANO
 from hodge_adapters.trajectories.euroc import file_of as euroc_file
 from hodge_adapters.trajectories.text import COLUMNS, has_w_first, tum_stamps, unit_of
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Trajectory
+from hodge_pipeline.types.input_files import read_input
 
 _FIELD = re.compile(r"[^\s,]+")
 NO_OPTIONS = ConfigDict(extra="forbid")
@@ -175,9 +177,14 @@ class NerfstudioRewriter:
 
 
 def _rewritten(folder: Path, original: Path, numbers: Callable[[list[str]], list[float] | None], *, first: int) -> Path:
-    """The text with the fields of each line from `first` on replaced by what `numbers` gives for the line, if any."""
+    """The file with the fields of each line from `first` on replaced by what `numbers` gives for the line, if any;
+    every other byte stays, whatever the text is encoded in and its lines end in.
+    """
+    with reading(original):
+        contents = read_input(original)
+    mark = BOM_UTF8 if contents.startswith(BOM_UTF8) else b""
     lines = []
-    for line in read_text(original).splitlines(keepends=True):
+    for line in contents[len(mark) :].decode("utf-8", "surrogateescape").splitlines(keepends=True):
         content = line.split("#", 1)[0]
         spans = [match.span() for match in _FIELD.finditer(content)]
         new = numbers([content[slice(*span)] for span in spans]) if spans else None
@@ -186,7 +193,7 @@ def _rewritten(folder: Path, original: Path, numbers: Callable[[list[str]], list
                 line = f"{line[:begin]}{float(value) + 0.0!r}{line[end:]}"
         lines.append(line)
     out = folder / f"refined{original.suffix}"
-    write_text_atomically(out, "".join(lines))
+    write_bytes_atomically(out, mark + "".join(lines).encode("utf-8", "surrogateescape"))
     return out
 
 
