@@ -35,6 +35,22 @@ def test_orb_slam_files_say_more(tmp_path: Path) -> None:
     assert found.distorted and found.units_per_metre == 5208.0
 
 
+def test_of_two_cameras_the_first_is_read(tmp_path: Path) -> None:
+    cameras = [("Camera1", "525 524 319.5 239.5 0.26"), ("Camera2", "9 9 9 9 9")]
+    names = ("fx", "fy", "cx", "cy", "k1")
+    lines = [f"{c}.{name}: {word}" for c, words in cameras for name, word in zip(names, words.split(), strict=True)]
+    (tmp_path / "a.yaml").write_text("\n".join(lines) + "\nCamera2.k2: 9.0\n")
+    found = read_intrinsics(tmp_path / "a.yaml")
+    assert found == Intrinsics(525.0, 524.0, 319.5, 239.5, distorted=True, distortion=(0.26, 0, 0, 0, 0))
+
+
+@pytest.mark.parametrize("line", ['Camera.type: "KannalaBrandt8"', "Camera1.type: KannalaBrandt8", "Camera1.k4: 0.01"])
+def test_a_fisheye_is_refused(tmp_path: Path, line: str) -> None:
+    (tmp_path / "a.yaml").write_text(f"%YAML:1.0\n{line}\nfx: 525\nfy: 524\ncx: 319.5\ncy: 239.5\nk1: 0.1\n")
+    with pytest.raises(SourceError, match=r"a\.yaml: its lens \((KannalaBrandt8|k4)\) is a fisheye"):
+        read_intrinsics(tmp_path / "a.yaml")
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
     [
@@ -47,6 +63,12 @@ def test_orb_slam_files_say_more(tmp_path: Path) -> None:
         ("a.yaml", "fx: 525\nfy: 525\ncx: 320\n"),
         ("a.json", "{"),
         ("a.json", "[]"),
+        ("a.json", "[" * 100000),
+        ("a.json", '{"width": Infinity, "height": 480, "intrinsic_matrix": [525, 0, 0, 0, 524, 0, 319.5, 239.5, 1]}'),
+        ("a.json", f'{{"width": 640, "height": 480, "intrinsic_matrix": [{"9" * 400}, 0, 0, 0, 524, 0, 9, 9, 1]}}'),
+        ("a.txt", "fx: 525\nfy: 524\ncx: 319.5\ncy: 239.5\nwidth: 1e999\nheight: 480\n"),
+        ("a.txt", "525 524 319.5 239.5 1e300 480\n"),
+        ("a.txt", f"m_depthWidth = nan\nm_depthHeight = inf\nm_calibrationDepthIntrinsic = {'1 ' * 16}\n"),
         ("a.json", '{"width": 0, "height": 0, "intrinsic_matrix": [525, 0, 0, 0, 524, 0, 319.5, 239.5, 1]}'),
     ],
 )

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from hodge_adapters.images.pixels import common_size, same_shape
+from hodge_adapters.json_files import numbers, read_json, whole
 from hodge_adapters.text_rows import read_rows, read_text, to_floats
 from hodge_pipeline.errors import CameraError, SourceError
 from hodge_pipeline.types import Camera
 
-_ENTRY = re.compile(r"^\s*\"?(?:Camera\d?\.)?(\w+)\"?\s*[:=]\s*([-+0-9.eE]+)\s*[,;]?\s*(?:#.*)?$", re.MULTILINE)
+_ENTRY = re.compile(r"^\s*\"?(?:Camera1?\.)?(\w+)\"?\s*[:=]\s*([-+0-9.eE]+)\s*[,;]?\s*(?:#.*)?$", re.MULTILINE)
+"""Of two cameras, as ORB-SLAM3 numbers them, the first."""
+_FISHEYE = re.compile(r"^\s*\"?Camera1?\.type\"?\s*:\s*\"?(Kannala\w*)", re.MULTILINE)
 _DISTORTION = ("k1", "k2", "k3", "p1", "p2")
 CAMERA_FILES = (
     "intrinsics.txt",
@@ -32,6 +35,7 @@ CAMERA_FILES = (
     "TUM3.yaml",
 )
 """After Open3D's JSON as ScanNet exports it, deep-video-mvs, and BundleFusion."""
+MAX_SIDE = 1 << 16
 LONGEST_READOUT_S = 1.0
 """Of a rolling shutter: slower cameras give no video."""
 _SUPPORTED = "`fx fy cx cy [width height]` on one line, a 3x3 matrix, `fx: …` lines, or Open3D's JSON"
@@ -100,12 +104,9 @@ def read_intrinsics(path: Path) -> Intrinsics:
     """The intrinsics in a file: one line `fx fy cx cy [width height]`, a 3x3 or 4x4 matrix K, `fx: …` lines as in
     ORB-SLAM's YAML (with `readout_s: …` for a rolling shutter), Open3D's JSON, or BundleFusion's `info.txt`.
 
-    Raises `SourceError` for anything else, and for numbers that are no camera.
+    Raises `SourceError` for anything else, for numbers that are no camera, and for a fisheye.
     """
-    text = read_text(path)
-    found = (
-        _from_json(text) if path.suffix == ".json" else _from_info(text) or _from_entries(text) or _from_numbers(path)
-    )
+    found = _from_json(path) if path.suffix == ".json" else _from_text(path)
     if found is None:
         raise SourceError(f"{path}: no intrinsics found: write {_SUPPORTED}")
     return checked(found, str(path))
@@ -113,13 +114,14 @@ def read_intrinsics(path: Path) -> Intrinsics:
 
 def checked(found: Intrinsics, where: str) -> Intrinsics:
     """The same, if it is a camera: finite, focal lengths not zero. Raises `SourceError`."""
-    numbers = (found.fx, found.fy, found.cx, found.cy)
+    pinhole = (found.fx, found.fy, found.cx, found.cy)
     scale = found.units_per_metre
-    bad_size = found.size is not None and min(found.size) <= 0
     if not abs(found.readout_s) < LONGEST_READOUT_S:
         raise SourceError(f"{where}: readout_s {found.readout_s:g} is no time in seconds in which an image is read")
-    if not all(map(math.isfinite, numbers)) or found.fx <= 0 or found.fy == 0 or bad_size or (scale and scale <= 0):
-        raise SourceError(f"{where}: fx fy cx cy = {numbers} is no pinhole camera: write {_SUPPORTED}")
+    if found.size is not None and min(found.size) <= 0:
+        raise SourceError(f"{where}: width and height are no whole numbers from 1 to {MAX_SIDE - 1}: mend them")
+    if not all(map(math.isfinite, pinhole)) or found.fx <= 0 or found.fy == 0 or (scale and not 0 < scale < math.inf):
+        raise SourceError(f"{where}: fx fy cx cy = {pinhole} is no pinhole camera: write {_SUPPORTED}")
     return found
 
 
@@ -131,6 +133,11 @@ def fit_note(camera: Camera) -> str | None:
     return f"the principal point {centre} lies outside the {camera.width}x{camera.height} image: check the intrinsics"
 
 
+def _from_text(path: Path) -> Intrinsics | None:
+    text = read_text(path)
+    return _from_info(text) or _from_entries(text, path) or _from_numbers(path)
+
+
 def _from_numbers(path: Path) -> Intrinsics | None:
     rows = [to_floats(row.fields) for row in read_rows(path)]
     if len(rows) == 1 and rows[0] and len(rows[0]) in (4, 6):
@@ -138,8 +145,8 @@ def _from_numbers(path: Path) -> Intrinsics | None:
         if not size:
             return Intrinsics(fx, fy, cx, cy)
         # Two more numbers may be distortion coefficients instead: those are never whole.
-        whole = all(value.is_integer() and value >= 1 for value in size)
-        return Intrinsics(fx, fy, cx, cy, (int(size[0]), int(size[1]))) if whole else None
+        are_whole = all(value.is_integer() and value >= 1 for value in size)
+        return Intrinsics(fx, fy, cx, cy, _size(*size)) if are_whole else None
     if len(rows) in (3, 4) and all(row and len(row) == len(rows) for row in rows):
         k = [row for row in rows if row]
         return Intrinsics(k[0][0], k[1][1], k[0][2], k[1][2])
@@ -152,14 +159,25 @@ def _from_info(text: str) -> Intrinsics | None:
     k, size = values.get("calibrationDepthIntrinsic", []), (values.get("depthWidth"), values.get("depthHeight"))
     if len(k) != 16 or not size[0] or not size[1]:
         return None
-    return Intrinsics(k[0], k[5], k[2], k[6], (int(size[0][0]), int(size[1][0])))
+    return Intrinsics(k[0], k[5], k[2], k[6], _size(size[0][0], size[1][0]))
 
 
-def _from_entries(text: str) -> Intrinsics | None:
+def _size(width: Any, height: Any) -> tuple[int, int]:
+    """Width and height in pixels, 0 for what is none."""
+    return whole(width, 1, MAX_SIDE) or 0, whole(height, 1, MAX_SIDE) or 0
+
+
+def _from_entries(text: str, path: Path) -> Intrinsics | None:
     entries = {name: to_floats([value]) for name, value in _ENTRY.findall(text)}
     values = {name: value[0] for name, value in entries.items() if value}
     if not {"fx", "fy", "cx", "cy"} <= values.keys():
         return None
+    if (fisheye := _FISHEYE.search(text)) or values.get("k4"):
+        lens = fisheye[1] if fisheye else "k4"
+        raise SourceError(
+            f"{path}: its lens ({lens}) is a fisheye, or has more than k1 k2 k3 p1 p2: undistort the images, then give "
+            "their pinhole camera"
+        )
     found = Intrinsics(
         values["fx"],
         values["fy"],
@@ -171,7 +189,7 @@ def _from_entries(text: str) -> Intrinsics | None:
         readout_s=values.get("readout_s", 0.0),
     )
     if {"width", "height"} <= values.keys():
-        return replace(found, size=(int(values["width"]), int(values["height"])))
+        return replace(found, size=_size(values["width"], values["height"]))
     return found
 
 
@@ -181,12 +199,8 @@ def _distortion(values: dict[str, float]) -> tuple[float, float, float, float, f
     return (k1, k2, p1, p2, k3) if any((k1, k2, p1, p2, k3)) else None
 
 
-def _from_json(text: str) -> Intrinsics | None:
+def _from_json(path: Path) -> Intrinsics:
     """Open3D's `camera_intrinsic.json`: the matrix is stored by columns."""
-    try:
-        content = json.loads(text)
-        matrix = [float(value) for value in content["intrinsic_matrix"]]
-        size = int(content["width"]), int(content["height"])
-    except (ValueError, KeyError, TypeError):
-        return None
-    return Intrinsics(matrix[0], matrix[4], matrix[6], matrix[7], size) if len(matrix) == 9 else None
+    content = read_json(path)
+    matrix = numbers(content.get("intrinsic_matrix"), 9, f"{path}: intrinsic_matrix").tolist()
+    return Intrinsics(matrix[0], matrix[4], matrix[6], matrix[7], _size(content.get("width"), content.get("height")))
