@@ -82,12 +82,20 @@ def test_coordinates_of_a_map_lose_whole_kilometres(tmp_path: Path) -> None:
         ("name,e,n,u,sigma\n1,2,3,4,-1\n2,2,3,4,0\n", ":3: its sigma or covariance is not positive"),
         ("name,lat,lon,alt\n1,5428000,457000,0\n", "are no degrees"),
         ("name,e,n,u\n1,nan,2,3\n", "no row has"),
+        ('name,e,n,u\n"a b",1,2,3\n"b,1,2,3\nc,1,2,3\n', ":3: cannot be cut into cells"),
     ],
 )
 def test_a_table_that_says_nothing_is_one_line(tmp_path: Path, text: str, why: str) -> None:
     with pytest.raises(SourceError, match="fixes.csv") as error:
         PositionsReader().open(table(tmp_path, text))
     assert why in str(error.value)
+
+
+def test_of_rows_with_the_same_name_and_stamp_the_first_is_kept(tmp_path: Path) -> None:
+    source = PositionsReader().open(table(tmp_path, "name,t,e,n,u\na,,1,2,3\na,,4,5,6\nb,1,7,8,9\nb,2,7,8,9\n"))
+    assert source.positions is not None and source.positions.names.tolist() == ["a", "b", "b"]
+    assert source.positions.points[0].tolist() == [1, 2, 3]
+    assert source.notes == ("1 row with the name and stamp of an earlier one left out: line 3",)
 
 
 def test_a_trajectory_with_a_head_is_no_table_of_positions(tmp_path: Path) -> None:

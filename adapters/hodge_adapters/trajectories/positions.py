@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 from hodge_adapters.text_rows import Row, first_text, listed, read_text
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
-from hodge_pipeline.types import Floats, Source
+from hodge_pipeline.types import Bools, Floats, Ints, Source, Words
 from hodge_pipeline.types.positions import Positions, from_geodetic
 from hodge_pipeline.types.text import counted
 
@@ -45,7 +45,10 @@ class PositionsReader:
         """By the first line: the names of a coordinate's three columns, and of a name or stamp."""
         path = Path(path)
         head = first_text(path).splitlines()
-        rows = _rows(head[:1])
+        try:
+            rows = _rows(head[:1], path)
+        except SourceError:
+            rows = []
         if not rows or not _axes(_columns(rows[0].fields)):
             return Sniff(0.0, "no line that names columns of positions")
         return Sniff(0.8, "its first line names columns of positions")
@@ -59,7 +62,7 @@ class PositionsReader:
 
 def read_positions(path: Path, notes: list[str]) -> Positions:
     """The positions of a table, what is left out in the notes."""
-    rows = _rows(read_text(path).lstrip("\ufeff").splitlines())
+    rows = _rows(read_text(path).lstrip("\ufeff").splitlines(), path)
     columns = _columns(rows[0].fields) if rows else {}
     axes = _axes(columns)
     if not axes:
@@ -77,24 +80,46 @@ def read_positions(path: Path, notes: list[str]) -> Positions:
         )
     if not good.any():
         raise SourceError(f"{path}: no row has a name or stamp and three coordinates: give {WANTED}")
-    names, stamps = names[good], stamps[good]
-    points, covariances = points[good], _covariances(path, rows, table)[good]
+    kept = _firsts(names, stamps, good)
+    if len(kept) < good.sum():
+        lines = [rows[row].line for row in np.setdiff1d(np.flatnonzero(good), kept)]
+        notes.append(
+            f"{counted(len(lines), 'row')} with the name and stamp of an earlier one left out: line {listed(lines)}"
+        )
+    names, stamps = names[kept], stamps[kept]
+    points, covariances = points[kept], _covariances(path, rows, table)[kept]
     if axes[0] == "lat":
         _check_degrees(path, points)
         return from_geodetic(points, covariances, names, stamps)
     return Positions(points, covariances, names, stamps).near_zero()
 
 
-def _rows(lines: Sequence[str]) -> list[Row]:
-    """The lines that hold any fields, cut as the first one is: at semicolons, tabs, commas or blanks."""
+def _firsts(names: Words, stamps: Floats, good: Bools) -> Ints:
+    """Of the good rows with the same name and stamp the first ones, ascending."""
+    rows = np.flatnonzero(good)
+    labels = np.array([f"{stamp} {name}" for name, stamp in zip(names[rows], stamps[rows], strict=True)])
+    return np.sort(rows[np.unique(labels, return_index=True)[1]])
+
+
+def _rows(lines: Sequence[str], path: Path) -> list[Row]:
+    """The lines that hold any fields, cut as the first one is: at semicolons, tabs, commas or blanks.
+
+    Raises `SourceError` with `file:line` where a quote is not closed.
+    """
     kept = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
     head, kept = kept[:1], [row for row in kept[1:] if not row[1].startswith("#")]
     kept = [(number, line.lstrip("# ")) for number, line in head] + kept
     mark = next((mark for mark in ";\t," if kept and mark in kept[0][1]), None)
     if mark is None:
         return [Row(number, line.split()) for number, line in kept]
-    cut = csv.reader((line for _, line in kept), delimiter=mark)
-    return [Row(number, [cell.strip() for cell in cells]) for (number, _), cells in zip(kept, cut, strict=False)]
+    return [Row(number, _cells(line, mark, f"{path}:{number}")) for number, line in kept]
+
+
+def _cells(line: str, mark: str, where: str) -> list[str]:
+    try:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=mark, strict=True))]
+    except csv.Error as error:
+        raise SourceError(f"{where}: cannot be cut into cells ({error}): close its quote or mend the line") from error
 
 
 def _columns(head: Sequence[str]) -> dict[str, int]:
