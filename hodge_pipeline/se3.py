@@ -16,6 +16,8 @@ from hodge_pipeline.types import Bools, Floats, Trajectory
 
 SMALL_ANGLE = 1e-4
 SAME_STAMP_S = 1e-6
+MAX_NUMBER = 1e100
+"""Past it squares and products of numbers overflow."""
 ARM_M = 1.0
 """Metres: a rotation counts as the displacement that it causes at this distance, about that of a room's walls."""
 
@@ -325,9 +327,11 @@ def has_pose(world_from_cam: Floats) -> Bools:
 
 
 def is_motion(matrix: Floats, tolerance: float = 1e-2) -> Bools:
-    """Where (...,) a matrix (..., 4, 4) is finite, its last row is (0, 0, 0, 1) and RᵀR is I within the tolerance."""
+    """Where (...,) a matrix (..., 4, 4) is finite, its last row is (0, 0, 0, 1) and RᵀR is I within the tolerance;
+    numbers past `MAX_NUMBER` count as infinite.
+    """
     matrix = np.asarray(matrix, float)
-    finite = has_pose(matrix)
+    finite = np.asarray((np.abs(matrix) < MAX_NUMBER).all(axis=(-1, -2)))
     safe = np.where(finite[..., None, None], matrix, 0.0)
     rotation = safe[..., :3, :3]
     gram_error = np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max(axis=(-1, -2))

@@ -114,9 +114,37 @@ def test_a_nerfstudio_camera_looks_along_minus_z(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "head",
+    [
+        "# exported by our tool\n#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x []\n",
+        "#timestamp [ns],p_x,p_y\n",
+        "#timestamp,x,y,z,qw,qx,qy,qz,vx,vy,vz,bgx,bgy,bgz,bax,bay,baz\n",
+        "timestamp,x,y,z,q_w,q_x,q_y,q_z\n",
+        "# a comment\n\n",
+    ],
+)
+@pytest.mark.parametrize("rest", ["", ",0" * 9])
+def test_euroc_is_known_below_any_head(tmp_path: Path, head: str, rest: str) -> None:
+    (tmp_path / "a.csv").write_text(f"{head}1403636580838555648,1,2,3,0.6,0,0,0.8{rest}\n")
+    reader = guess_reader(tmp_path / "a.csv")
+    assert isinstance(reader, EurocReader)
+    turned = se3.to_quat_xyzw(reader.open(tmp_path / "a.csv").trajectory.world_from_cam)
+    np.testing.assert_allclose(turned, [[0, 0, 0.8, 0.6]], atol=1e-15)
+
+
+def test_nanoseconds_with_x_first_are_no_euroc(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("#timestamp,x,y,z,qx,qy,qz,qw\n1403636580838555648,1,2,3,0,0,0.8,0.6\n")
+    reader = guess_reader(tmp_path / "a.csv")
+    assert isinstance(reader, TumPosesReader)
+    turned = se3.to_quat_xyzw(reader.open(tmp_path / "a.csv").trajectory.world_from_cam)
+    np.testing.assert_allclose(turned, [[0, 0, 0.8, 0.6]], atol=1e-15)
+
+
+@pytest.mark.parametrize(
     ("reader", "name", "text", "message"),
     [
         (EurocReader(), "a.csv", "#timestamp, q_RS_w\n1,0,0,0,0,0,0,0\n", "no line of"),
+        (EurocReader(), "a.csv", "1,1e308,0,0,1,0,0,0\n", "no line of"),
         (LogReader(), "a.log", "0 0 1\n1 0 0 0\n0 1 0 0\n0 0 2 0\n0 0 0 1\n", ":1: not"),
         (LogReader(), "a.log", "0 0 1\n1 0 0 0\n", "no blocks"),
         (Open3dReader(), "a.json", '{"class_name": "PoseGraph", "nodes": [{"pose": [1]}]}', "node 0: not 16"),

@@ -7,10 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hodge_adapters.trajectories.readers import TumPosesReader
 from hodge_adapters.trajectories.rewriting import TumRewriter
 from hodge_adapters.trajectories.text import KittiWriter, TumWriter, parse_tum, read_kitti, write_kitti, write_tum
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError, WorkspaceError
+from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.stages import Writer
 from hodge_pipeline.types import Source, Trajectory
 
@@ -50,7 +52,9 @@ def test_stamps_too_large_for_seconds_are_read_in_their_unit(tmp_path: Path, uni
     assert [line.split()[:2] for line in lines] == [[str(stamp * per_second), "1.0"] for stamp in stamps]
 
 
-@pytest.mark.parametrize("head", ["# timestamp tx ty tz qw qx qy qz", "time,x,y,z,q_w,q_x,q_y,q_z"])
+@pytest.mark.parametrize(
+    "head", ["# timestamp tx ty tz qw qx qy qz", "time,x,y,z,q_w,q_x,q_y,q_z", "# t q_RS_w q_RS_x"]
+)
 def test_a_head_that_names_w_first_is_followed_and_written_again(tmp_path: Path, head: str) -> None:
     path = tmp_path / "poses.txt"
     path.write_text(f"{head}\n5.5 1 2 3 0.6 0 0 0.8\n")
@@ -89,7 +93,16 @@ def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "line", ["1 0 0 0 0 0 0 0", "1 0 0 0 0 0 1", "x 0 0 0 0 0 0 1", "nan 0 0 0 0 0 0 1", "1 inf 0 0 0 0 0 1", "1 1 1"]
+    "line",
+    [
+        "1 0 0 0 0 0 0 0",
+        "1 0 0 0 0 0 1",
+        "x 0 0 0 0 0 0 1",
+        "nan 0 0 0 0 0 0 1",
+        "1 inf 0 0 0 0 0 1",
+        "1 1 1",
+        "1 1e308 0 0 0 0 0 1",
+    ],
 )
 def test_a_line_that_is_no_pose_is_named_or_noted(tmp_path: Path, line: str) -> None:
     path = tmp_path / "a.tum"
@@ -121,10 +134,31 @@ def test_an_empty_or_missing_or_binary_file_is_an_error(tmp_path: Path, reader) 
             reader(path)
 
 
+@pytest.mark.parametrize("row", ["{0} 100.{0} 1 2 3 0 0 0 1", "100.{0} 1 2 3 40 50 60 70"])
+def test_columns_that_hold_no_quaternion_are_refused(tmp_path: Path, row: str) -> None:
+    path = tmp_path / "a.tum"
+    path.write_text("".join(row.format(k) + "\n" for k in range(3)))
+    with pytest.raises(SourceError, match=r"a\.tum: no quaternion has a length near 1"):
+        parse_tum(path)
+
+
+@pytest.mark.parametrize(
+    "text", [f"0 {IDENTITY}", "stamp tx ty tz qx qy qz qw\n" + f"0 {IDENTITY}\n", f"1 {IDENTITY}\n2"]
+)
+def test_few_lines_are_a_trajectory_too(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.txt").write_text(text)
+    reader = guess_reader(tmp_path / "a.txt")
+    assert isinstance(reader, TumPosesReader)
+    assert reader.open(tmp_path / "a.txt").trajectory.stamps_s.tolist() == [float(text.endswith("2"))]
+
+
 def test_kitti_refuses_what_is_no_rigid_motion(tmp_path: Path) -> None:
     path = tmp_path / "00.txt"
     path.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0 0 0 1 0 0 0 0 1 0\n")
     with pytest.raises(SourceError, match=r"00\.txt:2: not a rigid motion"):
+        read_kitti(path)
+    path.write_text("1 0 0 1e308 0 1 0 0 0 0 1 0\n")
+    with pytest.raises(SourceError, match=r"00\.txt:1: not a rigid motion"):
         read_kitti(path)
 
 

@@ -82,8 +82,8 @@ def _edge(graph: ViewGraph, row: int) -> str:
 
 def _fault(matrix: Floats) -> str:
     """What is wrong with a matrix (4, 4) that is no motion, and what to do."""
-    if not np.isfinite(matrix).all():
-        return "is not finite: remove or mend it"
+    if not (np.abs(matrix) < se3.MAX_NUMBER).all():
+        return f"is not finite, or holds a number past {se3.MAX_NUMBER:g}: remove or mend it"
     if se3.is_motion(matrix.T):
         return "looks transposed: its last row carries the translation; pass the matrices transposed"
     mirrored = np.array(matrix)

@@ -10,12 +10,11 @@ from types import MappingProxyType
 
 import numpy as np
 
+from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bools, Floats, Ints
 from hodge_pipeline.types.input_files import beginning, read_input
 
-MAX_NUMBER = 1e100
-"""Past it squares and products of numbers overflow."""
 SNIFFED_LINES, SNIFFED_BYTES = 20, 1 << 16
 Columns = Mapping[str, tuple[int, ...] | None]
 """How many numbers may follow the keys of a tag; None: those that follow are more keys."""
@@ -109,8 +108,8 @@ def _parse(
     values = _numbers(path, tag, numbers, [parts[keys] for parts in split], columns)
     records = Records(path, np.array(numbers, np.int64), ints, values)
     with np.errstate(invalid="ignore"):
-        absurd = np.asarray(~(np.abs(values[:, : columns[0]]) < MAX_NUMBER).all(axis=1))
-    records.refuse(absurd, f"{tag} holds a nan, or a number past {MAX_NUMBER:g}: remove or mend that line")
+        absurd = np.asarray(~(np.abs(values[:, : columns[0]]) < se3.MAX_NUMBER).all(axis=1))
+    records.refuse(absurd, f"{tag} holds a nan, or a number past {se3.MAX_NUMBER:g}: remove or mend that line")
     return records
 
 

@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters.posed import trajectory_of, written
 from hodge_adapters.text_rows import Row, first_text, listed, read_text, to_floats, write_text_atomically
-from hodge_adapters.trajectories.text import ordered
+from hodge_adapters.trajectories.text import first_of_quaternion, ordered
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
@@ -28,13 +28,14 @@ class EurocReader:
     """Opens a EuRoC trajectory (`data.csv` of the ground truth, or an estimate in that form), or a folder with one."""
 
     def sniff(self, path: Path) -> Sniff:
-        """By the first lines: whole nanoseconds, then numbers with commas between."""
-        lines = first_text(file_of(Path(path))).splitlines()[:2]
-        if lines and "timestamp" in lines[0] and "q_RS_w" in lines[0]:
+        """By the first lines: EuRoC's header, or whole nanoseconds, then numbers with commas between."""
+        text = first_text(file_of(Path(path)))
+        w_first = first_of_quaternion(text) != "x"
+        if w_first and any("timestamp" in line and "q_RS_w" in line for line in text.splitlines()):
             return Sniff(0.95, "EuRoC's header")
-        fields = lines[0].split(",") if lines else []
-        stamped = len(fields) >= COLUMNS and len(fields[0].strip()) >= 16 and fields[0].strip().isdecimal()
-        return Sniff(0.85, "nanoseconds and commas") if stamped else Sniff(0.0, "no stamps in nanoseconds with commas")
+        if w_first and any(len(row.fields) >= COLUMNS and _is_nanoseconds(row.fields[0]) for row in _rows(text)[:2]):
+            return Sniff(0.85, "nanoseconds and commas")
+        return Sniff(0.0, "no stamps in nanoseconds with commas, then a quaternion with w first")
 
     def open(self, path: Path) -> Source:
         """The trajectory of the body that the file tells of (the IMU in EuRoC's own), ascending by stamp.
@@ -42,12 +43,12 @@ class EurocReader:
         Lines that are no pose are left out and noted. Raises `SourceError` where none is left.
         """
         path = file_of(Path(path))
-        poses = {row.line: _pose(row) for row in _rows(path)}
+        poses = {row.line: _pose(row) for row in _rows(read_text(path))}
         good = [pose for pose in poses.values() if pose is not None]
         bad = [line for line, pose in poses.items() if pose is None]
         if not good:
             raise SourceError(f"{path}: no line of `nanoseconds, x, y, z, qw, qx, qy, qz, …`: is it a EuRoC file?")
-        parsed = ordered(np.array(good))
+        parsed = ordered(np.array(good), path)
         notes = ["poses are those of the body in the file (EuRoC's ground truth: the IMU), not of a camera"]
         notes += parsed.notes
         if bad:
@@ -78,8 +79,13 @@ def file_of(path: Path) -> Path:
     return next((path / place for place in places if (path / place).is_file()), path) if path.is_dir() else path
 
 
-def _rows(path: Path) -> list[Row]:
-    lines = enumerate(read_text(path).splitlines(), 1)
+def _is_nanoseconds(word: str) -> bool:
+    """Whether it can be nanoseconds since 1970: a whole number of so many digits is no count of frames."""
+    return len(word) >= 16 and word.isdecimal()
+
+
+def _rows(text: str) -> list[Row]:
+    lines = enumerate(text.splitlines(), 1)
     rows = (Row(number, [field.strip() for field in line.split("#", 1)[0].split(",")]) for number, line in lines)
     return [row for row in rows if any(row.fields)]
 
@@ -89,7 +95,7 @@ def _pose(row: Row) -> list[float] | None:
     values = to_floats(row.fields[1:COLUMNS])
     stamp = row.fields[0]
     whole = stamp.isascii() and stamp.isdecimal() and len(stamp) < 20 and int(stamp) < MAX_STAMP_NS
-    sound = values is not None and len(values) == COLUMNS - 1 and bool(np.isfinite(values).all())
+    sound = values is not None and len(values) == COLUMNS - 1 and all(abs(v) < se3.MAX_NUMBER for v in values)
     if not whole or values is None or not sound or not 1e-6 < float(np.linalg.norm(values[3:])) < 1e6:
         return None
     return [float(stamp) / NANO, *values[:3], *values[4:], values[3]]

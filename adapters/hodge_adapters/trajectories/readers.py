@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import islice
 from pathlib import Path
 
 from pydantic import ConfigDict, Field
@@ -52,14 +51,18 @@ class KittiPosesReader:
 
 
 def first_rows(path: Path) -> list[list[str]]:
-    """The fields of the first lines that are no comment, cut at blanks, none where it cannot be read."""
-    lines = first_text(path, SNIFFED_BYTES).split("\n")[:-1] or [""]
-    rows = (line.split("#", 1)[0].split() for line in lines)
-    return list(islice((row for row in rows if row), SNIFFED_LINES))
+    """The fields of the first lines that are no comment, cut at blanks, none where it cannot be read.
+
+    A last line that does not end may be cut: it counts only where it is the only one.
+    """
+    *lines, last = first_text(path, SNIFFED_BYTES).split("\n")
+    rows = [row for line in lines if (row := line.split("#", 1)[0].split())] or [last.split("#", 1)[0].split()]
+    return [row for row in rows[:SNIFFED_LINES] if row]
 
 
 def _sniff_columns(path: Path, counts: tuple[int, ...], what: str) -> Sniff:
     rows = [to_floats(" ".join(row).replace(",", " ").split()) for row in first_rows(path)]
+    rows = rows[1:] if rows and rows[0] is None else rows  # a head without a mark of comment
     good = sum(row is not None and len(row) in counts for row in rows)
     if not good or good < 0.8 * len(rows):
         return Sniff(0.0, f"no {what}")

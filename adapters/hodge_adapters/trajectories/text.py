@@ -21,7 +21,11 @@ from hodge_pipeline.types.text import counted
 
 COLUMNS = (8, 9)
 """Of a line of TUM's: RTAB-Map adds the number of the node."""
-_QUATERNION = re.compile(r"\bq_?([wx])\b", re.IGNORECASE)
+_QUATERNION = re.compile(r"\bq_?(?:RS_)?([wx])\b", re.IGNORECASE)
+"""As TUM, and as EuRoC spell it."""
+
+NO_QUATERNION = 0.1
+"""So far from 1 is the length of none that is written with one decimal or more."""
 
 UNITS = (("nanoseconds", 1e17, 1e9), ("microseconds", 1e14, 1e6), ("milliseconds", 1e11, 1e3))
 """What all stamps from so much on count, and how many make a second: as seconds 1e11 is the year 5138."""
@@ -73,7 +77,7 @@ def parse_tum(path: Path) -> ParsedTrajectory:
     w_first = has_w_first(path)
     if w_first:
         table[:, 4:] = np.roll(table[:, 4:], -1, axis=1)
-    parsed = ordered(table)
+    parsed = ordered(table, path)
     notes += [f"{path.name}: {note}" for note in parsed.notes]
     if w_first:
         notes.append(f"{path.name}: quaternions are read with w first, as its head names them")
@@ -87,8 +91,13 @@ def parse_tum(path: Path) -> ParsedTrajectory:
 
 def has_w_first(path: Path) -> bool:
     """Whether the head of a TUM file names qw before qx, unlike TUM."""
-    named = _QUATERNION.search(first_text(path))
-    return named is not None and named[1].lower() == "w"
+    return first_of_quaternion(first_text(path)) == "w"
+
+
+def first_of_quaternion(head: str) -> str | None:
+    """Which of w and x a head names first, None where it names neither."""
+    named = _QUATERNION.search(head)
+    return named[1].lower() if named else None
 
 
 def tum_stamps(path: Path) -> Floats:
@@ -161,7 +170,7 @@ def _tum_table(rows: Sequence[Row]) -> tuple[Floats, list[Row]]:
     bad: list[Row] = []
     for row in rows:
         values = to_floats(row.fields) or []
-        sound = len(values) in COLUMNS and is_stamp(values[0]) and all(map(math.isfinite, values))
+        sound = len(values) in COLUMNS and is_stamp(values[0]) and all(abs(value) < se3.MAX_NUMBER for value in values)
         if sound and 1e-100 < math.hypot(*values[4:8]) < 1e100:  # beyond these the square is no normal number
             good.append(values[:8])
         else:
@@ -169,8 +178,17 @@ def _tum_table(rows: Sequence[Row]) -> tuple[Floats, list[Row]]:
     return np.array(good, np.float64).reshape(-1, 8), bad
 
 
-def ordered(table: Floats) -> ParsedTrajectory:
-    """The trajectory of rows (N, 8) `stamp tx ty tz qx qy qz qw`, ascending; of equal stamps the first is kept."""
+def ordered(table: Floats, path: Path) -> ParsedTrajectory:
+    """The trajectory of rows (N, 8) `stamp tx ty tz qx qy qz qw`, ascending; of equal stamps the first is kept.
+
+    Raises `SourceError` where no quaternion is one: the file has other columns.
+    """
+    lengths = np.linalg.norm(table[:, 4:], axis=1)
+    if (np.abs(lengths - 1) > NO_QUATERNION).all():
+        raise SourceError(
+            f"{path}: no quaternion has a length near 1, the first {lengths[0]:.4g}: other columns, such as an index "
+            "before the stamp, stand in its place: remove them"
+        )
     stamps, first = np.unique(table[:, 0], return_index=True)
     notes = []
     if len(stamps) < len(table):
