@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import open3d as o3d
 import pytest
@@ -111,6 +113,70 @@ def test_a_nerfstudio_camera_looks_along_minus_z(tmp_path: Path) -> None:
     assert source.frames[0].camera == Camera(8, 6, 9.0, 9.0, 3.5, 2.5)
     below = se3.transform(source.frames[0].world_from_cam, np.array([[0.0, 1, 0]]))
     np.testing.assert_allclose(below, [[5, 5, 7]])
+
+
+POSED = {"transform_matrix": np.eye(4).tolist()}
+LENS = {"w": 8, "h": 6, "fl_x": 9.0, "cx": 4.0, "cy": 3.0}
+DISTORTED = "the cameras have lens distortion, which is not corrected: undistort the images first"
+
+
+def nerfstudio_scene(folder: Path, entry: Mapping[str, object], **content: object) -> Path:
+    """A transforms.json of one frame beside its image of 8x6 pixels."""
+    (folder / "a.png").write_bytes(cv2.imencode(".png", np.zeros((6, 8, 3), np.uint8))[1].tobytes())
+    frames = [{"file_path": "a", **POSED, **entry}]
+    (folder / "transforms.json").write_text(json.dumps({**content, "frames": frames}))
+    return folder
+
+
+@pytest.mark.parametrize("size", [{}, {"w": 8, "h": 6}])
+def test_a_nerfstudio_camera_by_its_angle(tmp_path: Path, size: dict[str, int]) -> None:
+    """As Blender writes it: the width spans 90 degrees."""
+    source = check_reader(NerfstudioReader(), nerfstudio_scene(tmp_path, {}, camera_angle_x=np.pi / 2, **size))
+    camera = source.frames[0].camera
+    assert camera == Camera(8, 6, pytest.approx(4.0), pytest.approx(4.0), 3.5, 2.5) and source.notes == ()
+    (tmp_path / "a.png").unlink()
+    found = NerfstudioReader().open(tmp_path)
+    assert (found.frames[0].camera is not None) == bool(size)
+    assert any("camera_angle_x tells no camera" in note for note in found.notes) != bool(size)
+
+
+@pytest.mark.parametrize(
+    ("entry", "content", "note"),
+    [
+        ({}, {"camera_model": "OPENCV_FISHEYE", "k1": 0.0}, DISTORTED),
+        ({"camera_model": "SIMPLE_RADIAL_FISHEYE"}, {}, DISTORTED),
+        ({}, {"k4": 0.1}, "k4 of a lens that is no fisheye is left out: COLMAP has no such lens"),
+        ({"depth_file_path": "b.png"}, {}, "1 of 1 depth images are not read, since they are not there"),
+        ({"depth_file_path": "a.png"}, {"fl_x": None}, "1 of 1 depth images are not read, since they are not there"),
+    ],
+)
+def test_what_nerfstudio_files_lose_is_noted(tmp_path: Path, entry: dict, content: dict, note: str) -> None:
+    camera = {key: value for key, value in {**LENS, **content}.items() if value is not None}
+    notes = NerfstudioReader().open(nerfstudio_scene(tmp_path, entry, **camera)).notes
+    assert any(told.startswith(note) for told in notes)
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "PINHOLE", "simple_pinhole", None])
+def test_perspective_cameras_of_nerfstudio_have_no_note(tmp_path: Path, model: str | None) -> None:
+    source = NerfstudioReader().open(
+        nerfstudio_scene(tmp_path, {"depth_file_path": "a.png"}, **LENS, camera_model=model)
+    )
+    assert source.notes == () and source.frames[0].read_depth is not None
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({**LENS, "camera_model": "EQUIRECTANGULAR"}, "camera_model is 'EQUIRECTANGULAR'"),
+        ({**LENS, "depth_unit_scale_factor": "0.001"}, "depth_unit_scale_factor is '0.001'"),
+        ({**LENS, "depth_unit_scale_factor": 0}, "depth_unit_scale_factor is 0"),
+        ({"camera_angle_x": "wide"}, "w, h, camera_angle_x are no camera"),
+        ({"camera_angle_x": 4.0}, "w, h, camera_angle_x are no camera"),
+    ],
+)
+def test_a_nerfstudio_file_that_says_no_pinhole_is_refused(tmp_path: Path, content: dict, message: str) -> None:
+    with pytest.raises(SourceError, match=f"transforms.json.*{message}"):
+        NerfstudioReader().open(nerfstudio_scene(tmp_path, {}, **content))
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from functools import partial
@@ -14,7 +15,16 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters.images import pixels
-from hodge_adapters.images.lens_models import FISHEYE, HALF_PIXEL, PERSPECTIVE, image_file, named, pinhole_params
+from hodge_adapters.images.headers import MAX_SIDE
+from hodge_adapters.images.lens_models import (
+    FISHEYE,
+    HALF_PIXEL,
+    NAMES,
+    PERSPECTIVE,
+    image_file,
+    named,
+    pinhole_params,
+)
 from hodge_adapters.json_files import motion, number, objects, read_json, whole, write_json
 from hodge_adapters.posed import trajectory_of, written
 from hodge_adapters.text_rows import first_text, inside, listed, write_bytes_atomically
@@ -28,7 +38,6 @@ FILE = "transforms.json"
 IMAGES = "images"
 ENDINGS = (".png", ".jpg", ".jpeg")
 OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
-MAX_SIDE = 1 << 16
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 METRES_PER_UNIT = 1e-3
 
@@ -57,31 +66,44 @@ class NerfstudioReader:
         if not entries:
             raise SourceError(f"{file}: no frames in it: give a transforms.json that has some")
         notes: list[str] = []
-        frames = tuple(self._frame(file, row, content, entry) for row, entry in enumerate(entries))
+        content = {**_by_angle(file, content, entries, notes), **content}
+        merged = [{**content, **entry} for entry in entries]
+        frames = tuple(self._frame(file, row, values) for row, values in enumerate(merged))
         if len({frame.frame_id for frame in frames}) < len(frames):
             raise SourceError(f"{file}: two frames have the same file_path: remove one")
-        if any(number(place.get(name)) for place in (content, *entries) for name in DISTORTION):
+        lenses = [_lens(values) for values in merged]
+        if FISHEYE in lenses or any(number(values.get(name)) for values in merged for name in DISTORTION):
             notes.append("the cameras have lens distortion, which is not corrected: undistort the images first")
+        if any(lens == PERSPECTIVE and number(values.get("k4")) for lens, values in zip(lenses, merged, strict=True)):
+            notes.append("k4 of a lens that is no fisheye is left out: COLMAP has no such lens")
         lost = [frame.frame_id for frame in frames if frame.read_colour is None]
         if lost:
             notes.append(f"{len(lost)} of {len(frames)} images are not there as PNG or JPEG: {listed(lost)}")
+        told = zip(frames, merged, strict=True)
+        lost = [frame.frame_id for frame, values in told if values.get("depth_file_path") and not frame.read_depth]
+        if lost:
+            notes.append(
+                f"{len(lost)} of {len(frames)} depth images are not read, since they are not there or have no camera "
+                f"(w, h, fl_x): {listed(lost)}"
+            )
         poses = np.array([frame.world_from_cam for frame in frames])
         trajectory = Trajectory(np.arange(len(frames), dtype=float), poses)
         name = file.parent.resolve().name if path.is_dir() else file.stem
         return Source(name, path, frames[:: self.every], trajectory, notes=tuple(notes), files=(file,))
 
-    def _frame(self, file: Path, row: int, content: dict[str, Any], entry: dict[str, Any]) -> Frame:
+    def _frame(self, file: Path, row: int, values: dict[str, Any]) -> Frame:
         where = f"{file}: frame {row}"
-        pose = motion(entry.get("transform_matrix"), where) @ OPENGL_FROM_CAM
-        name = entry.get("file_path")
+        pose = motion(values.get("transform_matrix"), where) @ OPENGL_FROM_CAM
+        name = values.get("file_path")
         if not isinstance(name, str) or not name:
             raise SourceError(f"{where}: has no file_path: mend the file")
-        camera = _camera({**content, **entry}, where)
+        camera = _camera(values, where)
         colour = _existing(file.parent, name)
-        depth = _existing(file.parent, entry.get("depth_file_path"))
-        unit = number(content.get("depth_unit_scale_factor")) or METRES_PER_UNIT
-        if unit <= 0:
-            raise SourceError(f"{file}: depth_unit_scale_factor is {unit:g}: it is metres per stored unit")
+        depth = _existing(file.parent, values.get("depth_file_path"))
+        stated = values.get("depth_unit_scale_factor")
+        unit = METRES_PER_UNIT if stated is None else number(stated)
+        if unit is None or unit <= 0:
+            raise SourceError(f"{file}: depth_unit_scale_factor is {stated!r:.40}: give metres per stored unit")
         size = (camera.width, camera.height) if camera else None
         read = partial(pixels.read_depth, units_per_metre=1 / unit, no_depth=self.no_depth, size=size)
         return Frame(
@@ -92,7 +114,7 @@ class NerfstudioReader:
             read_colour=partial(pixels.read_colour, colour, size=size) if colour else None,
             encoded_depth=partial(pixels.encoded, depth, units_per_metre=1 / unit) if depth and camera else None,
             encoded_colour=partial(pixels.encoded, colour) if colour else None,
-            image=_image_file(colour, camera, {**content, **entry}) if colour and camera else None,
+            image=_image_file(colour, camera, values) if colour and camera else None,
             world_from_cam=pose,
         )
 
@@ -199,10 +221,39 @@ def _target(folder: Path, name: str) -> Path:
     return target
 
 
+def _by_angle(file: Path, content: dict[str, Any], entries: list[dict[str, Any]], notes: list[str]) -> dict[str, float]:
+    """The camera of a file that tells but the angle that its images' width spans, as Blender's do: by their size."""
+    if "camera_angle_x" not in content or any("fl_x" in place for place in (content, *entries)):
+        return {}
+    size = content.get("w"), content.get("h")
+    if None in size:
+        images = [image for entry in entries if (image := _existing(file.parent, entry.get("file_path")))]
+        if not images:
+            notes.append("camera_angle_x tells no camera, since neither w and h nor images are there: give these")
+            return {}
+        size = pixels.common_size(images)
+    width, height = (whole(side, 1, MAX_SIDE) for side in size)
+    angle = number(content["camera_angle_x"])
+    if not width or not height or not angle or not 0 < angle < math.pi:
+        raise SourceError(f"{file}: w, h, camera_angle_x are no camera: mend the file")
+    return {"w": width, "h": height, "fl_x": width / 2 / math.tan(angle / 2), "cx": width / 2, "cy": height / 2}
+
+
+def _lens(values: dict[str, Any]) -> str | None:
+    """Whether the camera is perspective or a fisheye by nerfstudio's names; None for another, such as a panorama."""
+    model = str(values.get("camera_model") or PERSPECTIVE).upper()
+    return NAMES[model][0] if model in NAMES else None
+
+
 def _camera(values: dict[str, Any], where: str) -> Camera | None:
-    """The camera, None where the file gives no intrinsics."""
+    """The camera, None where the file gives no intrinsics. Raises `SourceError` for one that is no pinhole."""
     if "fl_x" not in values:
         return None
+    if _lens(values) is None:
+        raise SourceError(
+            f"{where}: camera_model is {values['camera_model']!r:.40}, neither perspective nor a known fisheye: "
+            "give images of such a camera"
+        )
     width, height = whole(values.get("w"), 1, MAX_SIDE), whole(values.get("h"), 1, MAX_SIDE)
     fx, cx, cy = (number(values.get(key)) for key in ("fl_x", "cx", "cy"))
     fy = number(values.get("fl_y", fx))
@@ -214,7 +265,7 @@ def _camera(values: dict[str, Any], where: str) -> Camera | None:
 def _image_file(path: Path, camera: Camera, values: dict[str, Any]) -> ImageFile:
     """The image with the lens that the file says."""
     k1, k2, k3, k4, p1, p2 = (number(values.get(name)) or 0.0 for name in DISTORTION)
-    if values.get("camera_model") == FISHEYE:
+    if _lens(values) == FISHEYE:
         return image_file(path, camera, FISHEYE, (k1, k2, k3, k4))
     if k3:
         return image_file(path, camera, "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))

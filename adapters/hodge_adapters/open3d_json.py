@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
+from hodge_adapters.images.headers import MAX_SIDE
 from hodge_adapters.json_files import motion, numbers, objects, read_json, whole, write_json
 from hodge_adapters.posed import graph_of, trajectory_of, written, written_graph
 from hodge_adapters.text_rows import first_text
@@ -25,7 +26,6 @@ from hodge_pipeline.types.text import counted
 
 GRAPH, TRAJECTORY = "PoseGraph", "PinholeCameraTrajectory"
 CERTAIN, UNCERTAIN = "open3d", "open3d_uncertain"
-MAX_SIDE = 1 << 16
 VERSION = {"version_major": 1, "version_minor": 0}
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from hodge_adapters.images.headers import MAX_SIDE
 from hodge_adapters.images.pixels import common_size, same_shape
 from hodge_adapters.json_files import numbers, read_json, whole
 from hodge_adapters.text_rows import read_rows, read_text, to_floats
@@ -35,7 +36,6 @@ CAMERA_FILES = (
     "TUM3.yaml",
 )
 """After Open3D's JSON as ScanNet exports it, deep-video-mvs, and BundleFusion."""
-MAX_SIDE = 1 << 16
 LONGEST_READOUT_S = 1.0
 """Of a rolling shutter: slower cameras give no video."""
 _SUPPORTED = "`fx fy cx cy [width height]` on one line, a 3x3 matrix, `fx: …` lines, or Open3D's JSON"

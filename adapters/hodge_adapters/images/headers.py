@@ -13,6 +13,9 @@ from hodge_pipeline.errors import SourceError
 MAX_PIXELS = 1 << 26
 """No depth or colour camera is larger than 64 megapixels; a header that says so would only exhaust memory."""
 
+MAX_SIDE = 1 << 16
+"""Pixels: no image is as wide or as high."""
+
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_START, _JPEG_END = b"\xff\xd8", 0xD9
 _JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
