@@ -120,7 +120,8 @@ def test_what_is_not_read_is_counted(tmp_path):
         (EDGE + " 5", ":2: EDGE_SE3:QUAT needs 28 numbers after its ids, has 29"),
         ("EDGE_SE3:QUAT 1", ":2: EDGE_SE3:QUAT needs 2 ids and 28 numbers"),
         ("EDGE_SE2 1 2 0 0 0 1 0 0 1 0 1", "holds both EDGE_SE3:QUAT and EDGE_SE2"),
-        ("VERTEX_SE3:QUAT 4 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 4 0 0 0 0 0 0 1", "vertex 4 is given twice"),
+        ("VERTEX_SE3:QUAT 4 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 4 0 0 0 0 0 0 1", ":3: vertex 4 is given twice"),
+        ("PARAMS_SE3OFFSET 0 0 0 1 0 0 0 1\nPARAMS_SE3OFFSET 0 0 0 2 0 0 0 1", ":3: PARAMS_SE3OFFSET 0 is given twice"),
     ],
 )
 def test_a_malformed_line_is_named(tmp_path, line, message):
@@ -162,6 +163,29 @@ def test_toro_angles_are_roll_pitch_yaw(tmp_path):
     np.testing.assert_allclose(file.graph.i_from_j[0, :3, :3], rz @ ry @ rx, atol=1e-15)
     assert file.graph.edges.tolist() == [[0, 1], [1, 1]]
     assert any("EQUIV" in note for note in file.notes)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "merged"),
+    [
+        (["3 1", "3 5"], {1: 5, 3: 5}),
+        (["1 3", "5 3", "3 2"], {1: 2, 3: 2, 5: 2}),
+        (["1 2", "2 1"], {1: 2}),
+        (["4 4", "1 2", "4 5", "5 2"], {1: 2, 4: 2, 5: 2}),
+    ],
+)
+def test_all_vertices_that_equiv_lines_join_are_one(tmp_path, pairs, merged):
+    vertices = [f"VERTEX2 {key} {key} 0 0" for key in range(6)]
+    edges = [f"EDGE2 {key} {key + 1} 1 0 0 1 0 1 1 0 0" for key in range(5)]
+    graph = load_toro(write(tmp_path / "a.graph", *vertices, *edges, *(f"EQUIV {pair}" for pair in pairs))).graph
+    assert graph.vertex_ids.tolist() == [key for key in range(6) if key not in merged]
+    ends = [merged.get(key, key) for key in range(6)]
+    assert graph.vertex_ids[graph.edges].tolist() == [list(pair) for pair in zip(ends[:-1], ends[1:], strict=True)]
+
+
+def test_toro_vertices_given_twice_are_named(tmp_path):
+    with pytest.raises(SourceError, match=r"a\.graph:3: vertex 0 is given twice"):
+        load_toro(write(tmp_path / "a.graph", "VERTEX2 0 0 0 0", "EDGE2 0 1 1 0 0", "VERTEX2 0 0 0 0"))
 
 
 @pytest.mark.parametrize(

@@ -61,8 +61,10 @@ def edge_weights(graph: ViewGraph, dimension: int) -> Weights:
     used = ((kappa > 0) | (tau > 0)) & ~loops
     if loops.any():
         notes.append(f"{counted(int(loops.sum()), 'edge joins|edges join')} a vertex to itself: ignored")
-    if (silent := int((~used & ~loops).sum())) > 0:
-        notes.append(f"{counted(silent, 'edge has|edges have')} no information: ignored")
+    silent, stated = ~used & ~loops, information.any(axis=(1, 2))
+    for count, what in ((silent & ~stated, "no information"), (silent & stated, "information that is not positive")):
+        if count.any():
+            notes.append(f"{counted(int(count.sum()), 'edge has|edges have')} {what}: ignored")
     lengths = np.where(used, np.linalg.norm(graph.i_from_j[:, :3, 3], axis=1), 0.0)
     if (far := int((lengths > EARTH_M).sum())) > 0:
         i, j = graph.vertex_ids[graph.edges[np.argmax(lengths)]]

@@ -93,6 +93,7 @@ class Half:
 
 def _spatial(records: dict[str, Records], notes: list[str]) -> Half:
     vertices, edges = records["VERTEX_SE3:QUAT"], records["EDGE_SE3:QUAT"]
+    vertices.refuse_repeated("vertex")
     information = np.tile(np.eye(6), (len(edges), 1, 1))
     if has_information(edges, 7, notes):
         information = information_of_file(upper_triangle(edges.values[:, 7:], 6))
@@ -135,6 +136,7 @@ def _positions(known: Records, size: int) -> tuple[Floats, Floats]:
 
 def _planar(records: dict[str, Records], notes: list[str]) -> Half:
     vertices, edges = records["VERTEX_SE2"], records["EDGE_SE2"]
+    vertices.refuse_repeated("vertex")
     information = np.tile(np.eye(3), (len(edges), 1, 1))
     if has_information(edges, 3, notes):
         information = upper_triangle(edges.values[:, 3:], 3)
@@ -154,11 +156,8 @@ def _planar(records: dict[str, Records], notes: list[str]) -> Half:
     )
 
 
-def rows_of_keys(path: Path, vertex_keys: Ints, edge_keys: Ints) -> tuple[Ints, Ints]:
+def rows_of_keys(vertex_keys: Ints, edge_keys: Ints) -> tuple[Ints, Ints]:
     """The vertex ids in the file's order, then those that only edges name, and the edges as rows of them (E, 2)."""
-    if len(np.unique(vertex_keys)) != len(vertex_keys):
-        keys, counts = np.unique(vertex_keys, return_counts=True)
-        raise SourceError(f"{path}: vertex {keys[counts > 1][0]} is given twice: remove one of its lines")
     every = np.concatenate([vertex_keys, edge_keys.reshape(-1)])
     unique, first, inverse = np.unique(every, return_index=True, return_inverse=True)
     order = np.argsort(first, kind="stable")
@@ -171,7 +170,7 @@ def as_source(path: Path, half: Half, kind: str, fixed_keys: Ints, dimension: in
     """What the file holds: the graph, and the vertex poses as a trajectory whose stamps are row numbers, where every
     vertex has one; notes what was incomplete.
     """
-    ids, edges = rows_of_keys(path, half.vertex_keys, half.edge_keys)
+    ids, edges = rows_of_keys(half.vertex_keys, half.edge_keys)
     named = len(half.vertex_keys)
     if 0 < named < len(ids):
         notes.append(f"{len(ids) - named} of {len(ids)} vertices are named by edges only: no initial poses")

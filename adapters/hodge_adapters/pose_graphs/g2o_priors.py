@@ -30,7 +30,8 @@ Positions alone, in space, are what hdl_graph_slam writes of GPS.
 
 
 def offsets_of(priors: Records, parameters: Records, offsets: Floats) -> Floats:
-    """The motion body_from_sensor (P, 4, 4) that each prior names."""
+    """The motion body_from_sensor (P, 4, 4) that each prior names. Raises `SourceError` where it is not one."""
+    parameters.refuse_repeated(OFFSET)
     known = {int(key): row for row, key in enumerate(parameters.keys[:, 0])}
     rows = np.array([known.get(int(key), -1) for key in priors.keys[:, 1]], np.int64)
     priors.refuse(rows < 0, f"names a {OFFSET} that the file lacks: add that line")

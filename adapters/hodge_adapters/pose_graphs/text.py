@@ -37,6 +37,13 @@ class Records:
         if wrong.any():
             raise SourceError(f"{self.path}:{self.line_numbers[np.argmax(wrong)]}: {why}")
 
+    def refuse_repeated(self, what: str) -> None:
+        """Raise `SourceError` for the first line whose first key an earlier line has."""
+        repeated = np.ones(len(self), bool)
+        repeated[np.unique(self.keys[:, 0], return_index=True)[1]] = False
+        if repeated.any():
+            self.refuse(repeated, f"{what} {self.keys[np.argmax(repeated), 0]} is given twice: remove one of its lines")
+
 
 LANDMARK_TAGS = frozenset(
     ("LANDMARK", "POINT2", "POINT3", "VERTEX_XY", "VERTEX_TRACKXYZ", "VERTEX_POINT_XYZ")

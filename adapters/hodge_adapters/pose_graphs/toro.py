@@ -47,6 +47,7 @@ def euler_motions(values: Floats) -> Floats:
 
 def _spatial(records: dict[str, Records], notes: list[str]) -> Half:
     vertices, edges = records["VERTEX3"], records["EDGE3"]
+    vertices.refuse_repeated("vertex")
     information = np.broadcast_to(np.eye(6), (len(edges), 6, 6))
     if has_information(edges, 6, notes):
         information = np.roll(upper_triangle(edges.values[:, 6:], 6), (3, 3), axis=(1, 2))
@@ -56,6 +57,7 @@ def _spatial(records: dict[str, Records], notes: list[str]) -> Half:
 
 def _planar(records: dict[str, Records], notes: list[str]) -> Half:
     vertices, edges = records["VERTEX2"], records["EDGE2"]
+    vertices.refuse_repeated("vertex")
     information = np.broadcast_to(np.eye(3), (len(edges), 3, 3))
     if has_information(edges, 3, notes):
         raw = edges.values[:, 3:]
@@ -68,16 +70,18 @@ def _planar(records: dict[str, Records], notes: list[str]) -> Half:
 
 
 def _merge(half: Half, pairs: Ints) -> Half:
-    """The same with each EQUIV pair one vertex: the one named second."""
-    keep_of = {int(a): int(b) for a, b in pairs}
+    """The same with vertices that EQUIV pairs join, directly or by others, one vertex: one that is named second."""
+    keep_of: dict[int, int] = {}
 
     def root(key: int) -> int:
-        seen = set()
-        while key in keep_of and key not in seen:
-            seen.add(key)
-            key = keep_of[key]
+        while (kept := keep_of.get(key, key)) != key:
+            keep_of[key] = keep_of.get(kept, kept)  # half the way for the next
+            key = kept
         return key
 
+    for a, b in pairs.tolist():
+        if (joined := root(a)) != root(b):
+            keep_of[joined] = root(b)
     merged = np.array([root(int(key)) for key in half.edge_keys.reshape(-1)], np.int64).reshape(-1, 2)
     kept = np.array([root(int(key)) == key for key in half.vertex_keys], bool)
     return Half(half.vertex_keys[kept], half.poses[kept], merged, half.motions, half.information)
