@@ -334,6 +334,49 @@ def test_tables_of_points_are_read(tmp_path: Path, name: str, head: str, separat
     assert found.colours is None if not head else (found.colours == made.colours).all()
 
 
+FAR = np.array([[500_000.123, 5_400_000.456, 100.1], [500_000.223, 5_400_000.556, 100.2], [np.nan, 0, 0]])
+"""Where a map's coordinates are: float32 would round them to half a metre."""
+
+
+def far_file(name: str, text: bool) -> bytes:
+    """`FAR` in a file of text, or of doubles."""
+    rows = "\n".join(" ".join(map(repr, row)) for row in FAR.tolist()) + "\n"
+    values = rows.encode() if text else FAR.astype(">f8" if name == "a.vtk" else "<f8").tobytes()
+    kind = "ascii" if text else {"a.ply": "binary_little_endian", "a.vtk": "BINARY"}.get(name, "binary")
+    properties = "".join(f"property double {axis}\n" for axis in "xyz")
+    return {
+        "a.ply": f"ply\nformat {kind} 1.0\nelement vertex 3\n{properties}end_header\n",
+        "a.pcd": f"FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nPOINTS 3\nDATA {kind}\n",
+        "a.vtk": f"# vtk DataFile Version 3.0\nt\n{kind}\nDATASET POLYDATA\nPOINTS 3 double\n",
+    }.get(name, "").encode() + values
+
+
+@pytest.mark.parametrize("text", [True, False])
+@pytest.mark.parametrize("name", ["a.ply", "a.pcd", "a.vtk", "a.xyz"])
+def test_map_coordinates_are_counted_from_whole_kilometres(tmp_path: Path, name: str, text: bool) -> None:
+    if name == "a.xyz" and not text:
+        pytest.skip("a table is text")
+    (tmp_path / name).write_bytes(far_file(name, text))
+    source = CloudFolderReader().open(tmp_path)
+    found = source.frames[0].read_points()
+    np.testing.assert_allclose(found.points_in_cam, FAR[:2] - [500_000, 5_400_000, 0], atol=1e-5)
+    assert any(f"{name}: lies far" in note and "counted from 500000 5400000 0" in note for note in source.notes)
+    told = PlyWriter().write(tmp_path / "out.ply", source)
+    assert "1 point that is not finite left out" in told
+    in_millimetres = CloudFolderReader(units_per_metre=1000.0).open(tmp_path)
+    assert not any("counted from" in note for note in in_millimetres.notes), "5.4 km in metres"
+
+
+def test_points_of_a_far_frame_are_written_from_whole_kilometres(tmp_path: Path) -> None:
+    source = CloudFolderReader().open(fragments(tmp_path / "f", 1))
+    pose = se3.from_parts(np.eye(3), FAR[0])
+    frames = tuple(replace(frame, world_from_cam=pose) for frame in source.frames)
+    told = PlyWriter().write(tmp_path / "out.ply", replace(source, frames=frames))
+    assert "points lie far from zero: they are counted from 500000 5400000 0" in told
+    expected = cloud(seed=0).points_in_cam + FAR[0] - [500_000, 5_400_000, 0]
+    np.testing.assert_allclose(read_ply(tmp_path / "out.ply").points_in_cam, expected, atol=1e-4)
+
+
 def test_tables_of_something_else_are_no_scans_and_told(tmp_path: Path) -> None:
     (tmp_path / "gps.csv").write_text("stamp,x,y,z\n0,1,2,3\n")
     (tmp_path / "scan.pts").write_text("1 2 3\n")

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import struct
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,10 @@ from hodge_adapters.mcap.reader import McapReader
 from hodge_adapters.mcap.records import Malformed
 from hodge_adapters.mcap.ros_cdr import ros_decoder
 from hodge_adapters.mcap.ros_tf import TransformTree
+from hodge_adapters.mcap.writer import McapWriter
 from hodge_pipeline import se3
 from hodge_pipeline.testing import check_reader
-from hodge_pipeline.types import PointCloud
+from hodge_pipeline.types import PointCloud, Trajectory
 from mcap_data import Log, foxglove_header, odometry, point_cloud, pose_message, ros_header
 from mcap_encoding import (
     CDR,
@@ -245,3 +247,19 @@ def test_transforms_in_a_ring_end() -> None:
     for parent, child in (("a", "b"), ("b", "c"), ("c", "a")):
         tree.add(parent, child, 0.0, (1, 0, 0, 0, 0, 0, 1), is_static=True)
     assert tree.root("a") == "b" and se3.is_motion(tree.lookup("a", "c", np.zeros(1))).all()
+
+
+@pytest.mark.parametrize(("kind", "far"), [("<f8", 5_400_000.123), ("<f8", 12.5), ("<f4", 5_400_000.0)])
+def test_points_that_are_rounded_far_from_zero_are_told(tmp_path: Path, kind: str, far: float) -> None:
+    columns = {axis: np.array([far, far + 0.1, np.nan], kind) for axis in "xyz"}
+    size = np.dtype(kind).itemsize
+    log = Log()
+    cloud = point_cloud(columns, {"x": 0, "y": size, "z": 2 * size}, 3 * size)
+    log.add("/points", CLOUD, {"header": ros_header(100, "cam"), **cloud}, CDR)
+    source = McapReader().open(log.write(tmp_path / "a.mcap"))
+    told = any("/points: its points lie far from zero and are rounded" in note for note in source.notes)
+    assert told == (far == 5_400_000.123)
+    written = McapWriter().write(
+        tmp_path / "out.mcap", replace(source, trajectory=Trajectory(np.array([100.0]), np.eye(4)[None]))
+    )
+    assert "1 point that is not finite left out" in written

@@ -74,6 +74,11 @@ def written(what: str, source: Source, keeps: Collection[str] = ()) -> tuple[str
     )
 
 
+def left_out(no_numbers: int) -> tuple[str, ...]:
+    """A line that says how many points the reader of the clouds left out, none where it kept all."""
+    return (f"{counted(no_numbers, 'point that is|points that are')} not finite left out",) if no_numbers else ()
+
+
 def _stamps(trajectory: Trajectory | None) -> Floats:
     return np.zeros(0) if trajectory is None else trajectory.stamps_s
 

@@ -38,12 +38,17 @@ class Positions:
 
     def near_zero(self) -> Positions:
         """The same with whole kilometres taken off where they lie far from zero, which `origin` then says."""
-        middle = np.median(self.points, axis=0) if len(self) else np.zeros(3)
-        off = WHOLE_M * np.round(middle / WHOLE_M) * bool(np.abs(middle).max() > FAR_M)
+        off = whole_kilometres(self.points)
         if not off.any():
             return self
         origin = f"({', '.join(f'{value:.0f}' for value in off)}) of the given coordinates"
         return Positions(self.points - off, self.covariances, self.names, self.stamps_s, origin)
+
+
+def whole_kilometres(points: Floats) -> Floats:
+    """The whole kilometres (3,), in metres, nearest to the middle of points (P, 3) far from zero; else zeros."""
+    middle = np.median(points, axis=0) if len(points) else np.zeros(3)
+    return np.asarray(WHOLE_M * np.round(middle / WHOLE_M) * bool(np.abs(middle).max() > FAR_M))
 
 
 def from_geodetic(geodetic: Floats, covariances: Floats, names: Words, stamps_s: Floats) -> Positions:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bools, Bytes, Floats, Floats32, PointCloud
+from hodge_pipeline.types.positions import whole_kilometres
 
 NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 COLOURS = ("red", "green", "blue")
@@ -24,6 +25,8 @@ REVOLUTION_S = (0.01, 2.0)
 MAX_METRES = 1e9
 ROWS_IN_PART, LINES_IN_PART = 1 << 20, 1 << 17
 Columns: TypeAlias = Mapping[str, Any]
+Corner: TypeAlias = tuple[float, float, float]
+ZERO: Corner = (0.0, 0.0, 0.0)
 
 
 def points_of_columns(path: Path, columns: Columns) -> PointCloud:
@@ -31,8 +34,10 @@ def points_of_columns(path: Path, columns: Columns) -> PointCloud:
     return points_of_parts(path, parts_of(columns))
 
 
-def points_of_parts(path: Path, parts: Iterable[Columns]) -> PointCloud:
-    """The cloud of columns that come in parts, at least one, all with the same names."""
+def points_of_parts(path: Path, parts: Iterable[Columns], corner: Corner = ZERO) -> PointCloud:
+    """The cloud of columns that come in parts, at least one, all with the same names, counted from a corner: float32
+    has no room for map coordinates.
+    """
     points: list[Floats32] = []
     normals: list[Floats32] = []
     colours: list[NDArray[Any]] = []
@@ -41,7 +46,7 @@ def points_of_parts(path: Path, parts: Iterable[Columns]) -> PointCloud:
     for columns in parts:
         if not all(name in columns for name in "xyz"):
             raise SourceError(f"{path}: no x, y and z among {', '.join(columns) or 'nothing'}: give a file of points")
-        found = _stack(columns, "xyz")
+        found = _stack(columns, "xyz", corner)
         with np.errstate(invalid="ignore"):
             finite: Bools = np.asarray((np.abs(found) < MAX_METRES).all(axis=1))
         points.append(found[finite])
@@ -64,6 +69,20 @@ def points_of_parts(path: Path, parts: Iterable[Columns]) -> PointCloud:
         first_s=first_s,
         no_numbers=no_numbers,
     )
+
+
+def far_corner(columns: Columns, units_per_metre: float) -> Corner:
+    """The corner to count the points of columns from: whole kilometres, in the units of the columns, where they lie far
+    from zero with more digits than float32 has; else zero.
+    """
+    axes = [np.asarray(columns[axis]) for axis in "xyz" if axis in columns]
+    if len(axes) < 3 or np.result_type(np.float32, *axes) == np.float32:
+        return ZERO
+    points = np.column_stack(axes)
+    with np.errstate(invalid="ignore"):
+        points = points[(np.abs(points) < MAX_METRES).all(axis=1)]
+    x, y, z = (units_per_metre * whole_kilometres(points / units_per_metre)).tolist()
+    return x, y, z
 
 
 def unpacked(columns: dict[str, Any]) -> dict[str, Any]:
@@ -124,12 +143,12 @@ def _joined(parts: list[Any]) -> Any:
     return whole
 
 
-def _stack(columns: Mapping[str, Any], names: str | tuple[str, ...]) -> Floats32:
+def _stack(columns: Columns, names: str | tuple[str, ...], corner: Corner = ZERO) -> Floats32:
     out = np.zeros((len(columns[names[0]]), len(names)), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
         for at, name in enumerate(names):
             if name in columns:
-                out[:, at] = columns[name]
+                out[:, at] = columns[name] - corner[at] if corner[at] else columns[name]
     return out
 
 

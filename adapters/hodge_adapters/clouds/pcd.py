@@ -15,7 +15,7 @@ from hodge_adapters.clouds.columns import PACKED, number_rows, parts_of, points_
 from hodge_adapters.text_rows import reading
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import PointCloud
-from hodge_pipeline.types.input_files import read_input
+from hodge_pipeline.types.input_files import beginning, read_input
 
 MAX_HEADER_BYTES = 1 << 14
 MAX_EXPANSION = 264
@@ -45,11 +45,22 @@ def read_pcd(path: Path) -> PointCloud:
 
     Raises `SourceError` for a damaged header, for one that promises more than there is, for no x, y, z.
     """
+    return points_of_parts(path, pcd_parts(path))
+
+
+def pcd_parts(path: Path) -> Iterator[dict[str, Any]]:
+    """The same as columns, in parts."""
     with reading(path):
         contents = read_input(path)
     header = _read_header(path, contents)
     read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}[header.kind]
-    return points_of_parts(path, map(unpacked, read(path, contents, header)))
+    return map(unpacked, read(path, contents, header))
+
+
+def exceeds_float32(path: Path) -> bool:
+    """Whether its coordinates may have more digits than float32: text and doubles."""
+    header = _read_header(path, beginning(path, MAX_HEADER_BYTES))
+    return header.kind == "ascii" or ("x", "<f8", 1) in header.fields
 
 
 def expand_lzf(compressed: bytes, size: int) -> bytearray | None:

@@ -28,10 +28,15 @@ def read_ply(path: Path) -> PointCloud:
 
     Raises `SourceError` for a damaged header, for one that promises more than there is, for no x, y, z.
     """
+    return points_of_parts(path, ply_parts(path))
+
+
+def ply_parts(path: Path) -> Iterator[dict[str, Any]]:
+    """The same as columns, in parts."""
     with reading(path), open_input(path) as file:
         header = read_header(path, file)
         parts = _binary_parts if header.order else _ascii_parts
-        return points_of_parts(path, parts(path, file, header))
+        yield from parts(path, file, header)
 
 
 def write_ply(path: Path, cloud: PointCloud) -> None:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass as plain_dataclass
-from dataclasses import replace
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -15,21 +13,21 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.clouds.kitti import KITTI_RAISE_DEG, are_of_hdl64, ascends, is_scan, raised, read_bin, scan_poses
-from hodge_adapters.clouds.pcd import read_pcd
-from hodge_adapters.clouds.ply import read_ply, write_ply
-from hodge_adapters.clouds.scan_files import LIBRARIES, e57_scans, las_corner, library, read_e57, read_las
-from hodge_adapters.clouds.tables import names_points, read_table
-from hodge_adapters.clouds.uos import POSE, pose_file, read_uos, uos_pose
-from hodge_adapters.clouds.vtk import read_vtk
-from hodge_adapters.posed import posed_frames, written
+from hodge_adapters.clouds.fragments import ENDINGS, fragments_of, read_fragment
+from hodge_adapters.clouds.kitti import KITTI_RAISE_DEG, are_of_hdl64, ascends, is_scan, scan_poses
+from hodge_adapters.clouds.ply import write_ply
+from hodge_adapters.clouds.scan_files import LIBRARIES, library
+from hodge_adapters.clouds.tables import names_points
+from hodge_adapters.clouds.uos import POSE, pose_file
+from hodge_adapters.posed import left_out, posed_frames, written
 from hodge_adapters.text_rows import listed, natural
 from hodge_adapters.trajectories.log import read_log_file
 from hodge_adapters.trajectories.text import unit_of
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
-from hodge_pipeline.types import Floats, Frame, PointCloud, Source, ViewGraph
+from hodge_pipeline.types import Floats, Floats32, Frame, PointCloud, Source, ViewGraph
+from hodge_pipeline.types.positions import whole_kilometres
 from hodge_pipeline.types.text import counted
 
 OTHER_SCANS = frozenset((".pts", ".ptx", ".obj", ".stl", ".off", ".ptc", ".fls", ".rcp"))
@@ -65,7 +63,7 @@ class CloudFolderReader:
             return Sniff(0.0, "not a folder that can be read")
         count = sum(map(_is_scan, names))
         if not count:
-            return Sniff(0.0, f"no {', '.join(READERS)}")
+            return Sniff(0.0, f"no {', '.join(ENDINGS)}")
         return Sniff(
             0.8 if count * 2 > len(names) else 0.4, f"{count} point clouds among {counted(len(names), 'file')}"
         )
@@ -79,7 +77,7 @@ class CloudFolderReader:
         files = [path] if path.is_file() else self._files(path, notes)
         for file in files:
             _require(file)
-        fragments = _fragments(files, notes)
+        fragments = fragments_of(files, self.units_per_metre, notes)
         scanners = _scanners([fragment.path for fragment in fragments])
         if scanners:
             counts = ", ".join(f"{name} {scanners.count(name)}" for name in dict.fromkeys(scanners))
@@ -139,7 +137,7 @@ class CloudFolderReader:
             )
         if not found:
             why = "; ".join(unread) or "give a folder of fragments"
-            raise SourceError(f"{path}: no {', '.join(READERS)} like {self.pattern!r} in it: {why}")
+            raise SourceError(f"{path}: no {', '.join(ENDINGS)} like {self.pattern!r} in it: {why}")
         notes += unread
         return sorted(found, key=lambda file: natural(file.name))
 
@@ -184,92 +182,29 @@ class PlyWriter:
             se3.transform(np.eye(4) if pose is None else pose, cloud.points_in_cam.astype(float))
             for cloud, pose in clouds
         ]
+        in_world, notes = _near_zero(np.concatenate(points))
         colours = (
             np.concatenate([cloud.colours for cloud, _ in clouds if cloud.colours is not None]) if coloured else None
         )
-        write_ply(path, PointCloud(np.concatenate(points).astype(np.float32), None, colours))
-        count = sum(map(len, points))
-        return written(f"{counted(count, 'point')} of {len(frames)} clouds as one", source, {"point clouds"})
+        write_ply(path, PointCloud(in_world, None, colours))
+        what = f"{counted(len(in_world), 'point')} of {len(frames)} clouds as one"
+        lost = left_out(sum(cloud.no_numbers for cloud, _ in clouds))
+        return (*written(what, source, {"point clouds"}), *notes, *lost)
 
 
-@plain_dataclass(frozen=True)
-class Fragment:
-    """A file of points, or one scan (`row`) of a file with several; `corner` is where LAS coordinates count from."""
-
-    path: Path
-    row: int | None = None
-    corner: tuple[float, float, float] | None = None
-    world_from_scan: tuple[float, ...] | None = None
-
-    @property
-    def name(self) -> str:
-        """What a person calls it."""
-        return self.path.name if self.row is None else f"{self.path.name}/{self.row}"
-
-    def in_metres(self, units_per_metre: float) -> Floats | None:
-        """`world_from_scan` (4, 4) in metres, None where the file gives none."""
-        if self.world_from_scan is None:
-            return None
-        pose = np.array(self.world_from_scan).reshape(4, 4)
-        pose[:3, 3] /= units_per_metre
-        return pose
-
-
-def read_fragment(fragment: Fragment, *, units_per_metre: float, raise_deg: float = 0.0) -> PointCloud:
-    """The points of a fragment in metres, by the ending of its file; those of a `.bin` raised by an angle."""
-    if fragment.row is not None:
-        cloud = read_e57(fragment.path, fragment.row)
-    elif fragment.corner is not None:
-        cloud = read_las(fragment.path, fragment.corner)
-    else:
-        cloud = READERS[fragment.path.suffix.lower()](fragment.path)
-    if raise_deg and fragment.path.suffix.lower() == ".bin":
-        cloud = raised(cloud, raise_deg)
-    if units_per_metre == 1.0:
-        return cloud
-    return replace(cloud, points_in_cam=cloud.points_in_cam / np.float32(units_per_metre))
-
-
-def _fragments(files: list[Path], notes: list[str]) -> list[Fragment]:
-    """The fragments of the files: each scan of an E57 file is one; LAS files share the corner that they count from."""
-    las = [file for file in files if LIBRARIES.get(file.suffix.lower()) == "laspy"]
-    corner = las_corner(las) if las else None
-    if corner is not None:
-        words = " ".join(f"{value:.3f}" for value in corner)
-        notes.append(f"coordinates of {len(las)} LAS files are counted from their common lower corner {words}")
-    found: list[Fragment] = []
-    for file in files:
-        if file.suffix.lower() == ".e57":
-            for scan in e57_scans(file):
-                found.append(Fragment(file, scan.row, world_from_scan=_flat(scan.world_from_scan)))
-        else:
-            found.append(Fragment(file, None, corner if file in las else None, _flat(uos_pose(file))))
-    return found
-
-
-READERS: Mapping[str, Callable[[Path], PointCloud]] = {
-    ".ply": read_ply,
-    ".pcd": read_pcd,
-    ".las": read_las,
-    ".laz": read_las,
-    ".e57": read_e57,
-    ".bin": read_bin,
-    ".xyz": read_table,
-    ".asc": read_table,
-    ".csv": read_table,
-    ".3d": read_uos,
-    ".vtk": read_vtk,
-}
-
-
-def _flat(pose: Floats | None) -> tuple[float, ...] | None:
-    return None if pose is None else tuple(pose.ravel().tolist())
+def _near_zero(points: Floats) -> tuple[Floats32, list[str]]:
+    """Points (P, 3) as float32, and a note where whole kilometres are taken off: it has no room for map coordinates."""
+    near, off = points.astype(np.float32), whole_kilometres(points)
+    if not off.any() or np.array_equal(near, points):
+        return near, []
+    words = " ".join(f"{value:.0f}" for value in off)
+    return (points - off).astype(np.float32), [f"points lie far from zero: they are counted from {words}"]
 
 
 def _is_scan(path: Path) -> bool:
     """By its ending; `.bin` by its name as well, `.csv` by its first line."""
     ending = path.suffix.lower()
-    return ending in READERS and (ending != ".bin" or is_scan(path.name)) and (ending != ".csv" or names_points(path))
+    return ending in ENDINGS and (ending != ".bin" or is_scan(path.name)) and (ending != ".csv" or names_points(path))
 
 
 def _listed(files: set[Path]) -> str:
@@ -279,8 +214,8 @@ def _listed(files: set[Path]) -> str:
 def _require(path: Path) -> None:
     """Raise `SourceError` early where a file's library is not there, or its ending unknown."""
     ending = path.suffix.lower()
-    if ending not in READERS:
-        raise SourceError(f"{path}: not one of {', '.join(READERS)}: convert it to PLY")
+    if ending not in ENDINGS:
+        raise SourceError(f"{path}: not one of {', '.join(ENDINGS)}: convert it to PLY")
     if ending in LIBRARIES:
         library(LIBRARIES[ending], path)
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from hodge_adapters.clouds.columns import ROWS_IN_PART, points_of_columns, points_of_parts
+from hodge_adapters.clouds.columns import COLOURS, ROWS_IN_PART, Columns, Corner, parts_of
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Floats, PointCloud
+from hodge_pipeline.types import Floats
 from hodge_pipeline.types.input_files import open_input
 
 LIBRARIES = {".las": "laspy", ".laz": "laspy", ".e57": "pye57"}
@@ -40,7 +40,7 @@ class Scan:
     world_from_scan: Floats | None
 
 
-def las_corner(paths: Sequence[Path]) -> tuple[float, float, float]:
+def las_corner(paths: Sequence[Path]) -> Corner:
     """The lower corner (x, y, z) of all these files, from their headers."""
     corners = []
     for path in paths:
@@ -68,11 +68,11 @@ def _check_counts(path: Path) -> None:
         raise ValueError(f"counts {records} and {extended} records, points from byte {points_at} of {size} on")
 
 
-def read_las(path: Path, corner: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> PointCloud:
-    """The points of a LAS or LAZ file counted from a corner: float32 has no room for map coordinates."""
+def las_parts(path: Path) -> Iterator[Columns]:
+    """The points of a LAS or LAZ file as columns, in parts."""
     with _named(path, "laspy"), _opened_las(path) as file:
         _check_points(path, file.header.point_count)
-        return points_of_parts(path, (_las_columns(part, corner) for part in _las_parts(file)))
+        yield from map(_las_columns, _las_chunks(file))
 
 
 def _opened_las(path: Path) -> Any:
@@ -87,18 +87,16 @@ def _check_points(path: Path, count: int) -> None:
         raise ValueError(f"says {count} points in {path.stat().st_size} bytes")
 
 
-def _las_parts(file: Any) -> Iterator[Any]:
+def _las_chunks(file: Any) -> Iterator[Any]:
     if not file.header.point_count:
         yield file.read()
         return
     yield from file.chunk_iterator(ROWS_IN_PART)
 
 
-def _las_columns(part: Any, corner: tuple[float, float, float]) -> dict[str, Any]:
-    columns: dict[str, Any] = {name: np.asarray(part[name]) - corner[at] for at, name in enumerate("xyz")}
-    if "red" in part.point_format.dimension_names:
-        columns |= {name: np.asarray(part[name]) for name in ("red", "green", "blue")}
-    return columns
+def _las_columns(part: Any) -> Columns:
+    coloured = "red" in part.point_format.dimension_names
+    return {name: np.asarray(part[name]) for name in (*"xyz", *(COLOURS if coloured else ()))}
 
 
 def e57_scans(path: Path) -> list[Scan]:
@@ -118,8 +116,8 @@ def e57_scans(path: Path) -> list[Scan]:
     return scans
 
 
-def read_e57(path: Path, row: int = 0) -> PointCloud:
-    """The points of one scan of an E57 file, in the scanner's axes."""
+def e57_parts(path: Path, row: int = 0) -> Iterator[Columns]:
+    """The points of one scan of an E57 file as columns, in parts, in the scanner's axes."""
     with _named(path, "pye57"):
         file = _opened_e57(path)
         _check_points(path, file.get_header(row).point_count)
@@ -129,7 +127,7 @@ def read_e57(path: Path, row: int = 0) -> PointCloud:
         if "colorRed" in scan:
             for name in ("Red", "Green", "Blue"):
                 columns[name.lower()] = np.asarray(scan[f"color{name}"])[good]
-    return points_of_columns(path, columns)
+    yield from parts_of(columns)
 
 
 def _opened_e57(path: Path) -> Any:

@@ -7,11 +7,11 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
-from hodge_adapters.clouds.columns import number_rows, points_of_parts
+from hodge_adapters.clouds.columns import Columns, number_rows
 from hodge_adapters.clouds.ply import COLOURS
 from hodge_adapters.text_rows import first_text, reading, to_floats
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Floats, PointCloud
+from hodge_pipeline.types import Floats
 from hodge_pipeline.types.input_files import open_input
 
 SEPARATORS = bytes.maketrans(b",;", b"  ")
@@ -22,20 +22,21 @@ def names_points(path: Path) -> bool:
     return fields_of(first_text(path))[:3] == ["x", "y", "z"]
 
 
-def read_table(path: Path) -> PointCloud:
-    """The points of a table: columns by the names on its first line, as CloudCompare's `//X Y Z R G B`; without names
-    its first three numbers. Raises `SourceError` where rows differ in length or are no numbers.
+def table_parts(path: Path) -> Iterator[Columns]:
+    """The points of a table as columns, in parts, by the names on its first line, as CloudCompare's `//X Y Z R G B`;
+    without names its first three numbers. Raises `SourceError` where rows differ in length or are no numbers.
     """
     fields = fields_of(first_text(path))
     named = to_floats(fields) is None
     if len(fields) < 3:
         raise SourceError(f"{path}: its first line holds no x, y and z: give a file of points")
     names = [COLOURS.get(name, name) for name in fields] if named else [*"xyz", *(f"_{at}" for at in fields[3:])]
-    return points_of_rows(path, names, int(named))
+    return row_parts(path, names, int(named))
 
 
-def points_of_rows(path: Path, names: Sequence[str], skipped: int) -> PointCloud:
-    """The points of a text file whose lines, after those `skipped`, are rows of so many numbers; blank lines are none.
+def row_parts(path: Path, names: Sequence[str], skipped: int) -> Iterator[Columns]:
+    """The columns, in parts, of a text file whose lines, after those `skipped`, are rows of so many numbers; blank
+    lines are none.
 
     Raises `SourceError` where they are not.
     """
@@ -44,7 +45,7 @@ def points_of_rows(path: Path, names: Sequence[str], skipped: int) -> PointCloud
         file.seek(0)
         lines = (line.translate(SEPARATORS) for line in file if line.strip())
         tables: Iterator[Floats] = number_rows(path, islice(lines, skipped, None), count, len(names))
-        return points_of_parts(path, (dict(zip(names, table.T, strict=True)) for table in tables))
+        yield from (dict(zip(names, table.T, strict=True)) for table in tables)
 
 
 def fields_of(text: str) -> list[str]:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_adapters.clouds.tables import fields_of, points_of_rows
+from hodge_adapters.clouds.columns import points_of_parts
+from hodge_adapters.clouds.tables import fields_of, row_parts
 from hodge_adapters.text_rows import first_text, read_rows, to_floats
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -30,7 +31,7 @@ def read_uos(path: Path) -> PointCloud:
     width = len(fields_of(second if header else first))
     if width < 3:
         raise SourceError(f"{path}: holds no rows of x, y and z: give a scan of 3DTK")
-    cloud = points_of_rows(path, [*"xyz", *map(str, range(3, width))], int(header))
+    cloud = points_of_parts(path, row_parts(path, [*"xyz", *map(str, range(3, width))], int(header)))
     points = cloud.points_in_cam @ (AHEAD_LEFT_UP.T / UNITS_PER_METRE).astype(np.float32)
     return replace(cloud, points_in_cam=points)
 

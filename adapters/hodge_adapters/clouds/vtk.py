@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from hodge_adapters.clouds.columns import points_of_columns
+from hodge_adapters.clouds.columns import Columns, parts_of
 from hodge_adapters.text_rows import reading
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Floats, PointCloud
+from hodge_pipeline.types import Floats
 from hodge_pipeline.types.input_files import read_input
 
 _HEADER = re.compile(rb"# vtk DataFile[^\n]*\n[^\n]*\n\s*(ASCII|BINARY)\s", re.IGNORECASE)
@@ -21,8 +22,9 @@ LEAST_DIGITS = 2
 """Bytes of a number in text, with the blank before the next."""
 
 
-def read_vtk(path: Path) -> PointCloud:
-    """The `POINTS` of a file, of whatever dataset (PolyData as a rule); what it says of them is left.
+def vtk_parts(path: Path) -> Iterator[Columns]:
+    """The `POINTS` of a file as columns, in parts, of whatever dataset (PolyData as a rule); what it says of them is
+    left.
 
     Raises `SourceError` for another format, for sizes that its bytes cannot hold, for text that is no numbers.
     """
@@ -39,7 +41,7 @@ def read_vtk(path: Path) -> PointCloud:
     values = _numbers(contents[start:], count) if in_text else np.frombuffer(contents, code, count, start)
     if len(values) != count:
         raise SourceError(f"{path}: says {count // 3} points, has {len(values) // 3}: copy it again")
-    return points_of_columns(path, dict(zip("xyz", values.reshape(-1, 3).T, strict=True)))
+    yield from parts_of(dict(zip("xyz", values.reshape(-1, 3).T, strict=True)))
 
 
 def _numbers(text: bytes, count: int) -> Floats:

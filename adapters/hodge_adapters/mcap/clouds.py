@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_adapters.clouds.columns import TIMES, points_of_columns, unpacked
+from hodge_adapters.clouds.columns import TIMES, far_corner, points_of_columns, unpacked
 from hodge_adapters.mcap.fields import Message, Payload, part, parts, pose_values, text, whole
 from hodge_adapters.mcap.records import Malformed
 from hodge_pipeline import se3
@@ -71,6 +71,14 @@ def read_points(payload: Payload, layout: CloudLayout) -> PointCloud:
     normals = cloud.normals_in_cam
     turned = None if normals is None else (normals @ motion[:3, :3].T).astype(np.float32)
     return replace(cloud, points_in_cam=points, normals_in_cam=turned)
+
+
+def lies_far(payload: Payload, layout: CloudLayout) -> bool:
+    """Whether the points are doubles so far from zero that float32 has no room for them; raises `SourceError`."""
+    if not any(name == "x" and kind.endswith("f8") for name, kind, _ in layout.fields):
+        return False
+    columns = _columns(payload, layout, payload.read())
+    return any(far_corner({axis: columns[axis] for axis in "xyz"}, 1.0))
 
 
 def _checked(

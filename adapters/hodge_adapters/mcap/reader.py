@@ -18,7 +18,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters.association import nearest_in_runs
 from hodge_adapters.images.camera_files import Intrinsics, checked
-from hodge_adapters.mcap.clouds import read_points
+from hodge_adapters.mcap.clouds import lies_far, read_points
 from hodge_adapters.mcap.files import find_files, sniff_recording
 from hodge_adapters.mcap.fixes import positions_of
 from hodge_adapters.mcap.images import ImageLayout, encoded_image, read_colour, read_depth
@@ -191,6 +191,10 @@ class McapReader:
     def _cloud_frames(self, recording: Recording, notes: list[str]) -> tuple[list[Frame], str]:
         topic = self._pick(recording.clouds, self.points_topic, "points_topic", notes)
         clouds = one_per_stamp(topic, recording.clouds[topic], notes)
+        if lies_far(clouds[0].payload, clouds[0].layout):
+            notes.append(
+                f"{topic}: its points lie far from zero and are rounded, since 32-bit numbers lose digits there"
+            )
         frames = [
             Frame(row, cloud.stamp_s, read_points=partial(read_points, cloud.payload, cloud.layout))
             for row, cloud in enumerate(clouds)

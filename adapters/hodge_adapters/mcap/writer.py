@@ -12,7 +12,7 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters.mcap.ros_definitions import definition
-from hodge_adapters.posed import trajectory_of, written
+from hodge_adapters.posed import left_out, trajectory_of, written
 from hodge_adapters.text_rows import opened_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -46,12 +46,16 @@ class McapWriter:
                 channels[topic] = writer.register_channel(topic, "cdr", schema)
             for stamp_s, pose in zip(trajectory.stamps_s.tolist(), trajectory.world_from_cam, strict=True):
                 _add(writer, channels[TF[0]], stamp_s, _transform(stamp_s, pose))
+            no_numbers = 0
             for frame in frames:
                 assert frame.read_points is not None
-                _add(writer, channels[POINTS[0]], frame.stamp_s, _cloud(frame.stamp_s, frame.read_points()))
+                cloud = frame.read_points()
+                no_numbers += cloud.no_numbers
+                _add(writer, channels[POINTS[0]], frame.stamp_s, _cloud(frame.stamp_s, cloud))
             writer.finish()  # type: ignore[no-untyped-call]
         clouds = f", {counted(len(frames), 'cloud')} on {POINTS[0]}" if frames else ""
-        return written(f"{counted(len(trajectory), 'pose')} on {TF[0]}{clouds}", source, {"stamps", "point clouds"})
+        what = f"{counted(len(trajectory), 'pose')} on {TF[0]}{clouds}"
+        return (*written(what, source, {"stamps", "point clouds"}), *left_out(no_numbers))
 
 
 def _add(writer: Writer, channel: int, stamp_s: float, message: _Cdr) -> None:
