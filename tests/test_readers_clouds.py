@@ -152,7 +152,24 @@ def test_one_cloud_of_all_fragments(tmp_path: Path) -> None:
             "says 999999999999 points",
         ),
         ("a.ply", b"ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int v\nend_header\n", "no vertices"),
+        (
+            "a.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty int x\nproperty int y\nproperty int z\nend_header\n"
+            b"1 2 3\n\n4 5 6\n",
+            "says 1 points, has 2",
+        ),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nend_header\n1\n", "vertices hold lists, nothing"),
         ("a.pcd", b"# .PCD\n", "no PCD header"),
+        (
+            "a.pcd",
+            b"FIELDS x y z i\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 0\nPOINTS 1\nDATA ascii\n1 2 3\n",
+            "fit together",
+        ),
+        ("a.csv", b"x,y,z,x\n1,2,3,4\n", "names x twice"),
+        ("a.xyz", b"1 2 3\n\n4 5 x\n", "point 2, `4 5 x`, is no row of 3 numbers"),
+        ("a.xyz", b"1 2 3 house\n", "point 1, `1 2 3 house`, is no row of 4 numbers"),
+        ("a.xyz", b"2\n1 2 3\n", "says 2 points, has 1"),
+        ("a.xyz", b"1,2,3;4\n", "no x, y and z"),
         ("a.pcd", b"FIELDS x y\nSIZE 4 4\nTYPE F F\nPOINTS 99999999999\nDATA binary\n", "cannot hold"),
         ("a.pcd", b"FIELDS x y\nSIZE 4\nTYPE F F\nPOINTS 1\nDATA binary\n", "does not fit together"),
         ("a.pcd", b"FIELDS x\nSIZE 4\nTYPE F\nPOINTS 2\nDATA binary_compressed\n\x01\0\0\0\x08\0\0\0\x00", "damaged"),
@@ -377,6 +394,43 @@ def test_points_of_a_far_frame_are_written_from_whole_kilometres(tmp_path: Path)
     np.testing.assert_allclose(read_ply(tmp_path / "out.ply").points_in_cam, expected, atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\ufeff1.5 2.5 3.5\n4.5 5.5 6.5\n",
+        "\ufeff# a scan\n# of a hall\n\n1.5 2.5 3.5\n// half of it\n4.5 5.5 6.5\n",
+        "2\n1.5 2.5 3.5\n4.5 5.5 6.5\n",
+        "# a scan\n//X Y Z\n2\n1.5 2.5 3.5\n4.5 5.5 6.5\n",
+        "1,5;2,5;3,5\n4,5;5,5;6,5\n",
+        "x;y;z\n1,5;2,5;3,5\n4,5;5,5;6,5\n",
+    ],
+)
+def test_what_stands_above_rows_and_between_their_numbers(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.xyz").write_text(text)
+    found = CloudFolderReader().open(tmp_path).frames[0].read_points()
+    np.testing.assert_array_equal(found.points_in_cam, [[1.5, 2.5, 3.5], [4.5, 5.5, 6.5]])
+
+
+COLOUR_HEADS = {
+    "a.ply": "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+    "property {0} red\nproperty {0} green\nproperty {0} blue\nend_header\n",
+    "a.pcd": "FIELDS x y z red green blue\nSIZE 4 4 4 {1} {1} {1}\nTYPE F F F U U U\nWIDTH 2\nHEIGHT 1\nDATA ascii\n",
+    "a.csv": "x,y,z,r,g,b\n",
+}
+
+
+@pytest.mark.parametrize("name", COLOUR_HEADS)
+@pytest.mark.parametrize("bits", [8, 16])
+def test_colours_in_text_have_the_bits_that_are_declared(tmp_path: Path, name: str, bits: int) -> None:
+    head = COLOUR_HEADS[name].format({8: "uchar", 16: "ushort"}[bits], bits // 8)
+    stored, colour = ("0 1 1", [0, 1, 1]) if bits == 8 else ("65535 30000 0", [255, 116, 0])
+    if name == "a.csv" and bits == 8:
+        colour = [0, 255, 255]  # nothing tells them from fractions
+    (tmp_path / name).write_text(head + f"1 2 3 {stored}\n" * 2)
+    found = CloudFolderReader().open(tmp_path).frames[0].read_points()
+    assert found.colours.tolist() == [colour, colour]
+
+
 def test_tables_of_something_else_are_no_scans_and_told(tmp_path: Path) -> None:
     (tmp_path / "gps.csv").write_text("stamp,x,y,z\n0,1,2,3\n")
     (tmp_path / "scan.pts").write_text("1 2 3\n")
@@ -387,5 +441,5 @@ def test_tables_of_something_else_are_no_scans_and_told(tmp_path: Path) -> None:
     assert [frame.frame_id for frame in source.frames] == ["a.csv"]
     assert "2 files are scans of another format, left out: gps.csv, scan.pts" in source.notes[0]
     (tmp_path / "a.csv").write_text("x,y,z\n1,2\n")
-    with pytest.raises(SourceError, match=r"a\.csv: its points are no rows of 3 numbers|a\.csv: says 1 points"):
+    with pytest.raises(SourceError, match=r"a\.csv: point 1, `1 2`, is no row of 3 numbers"):
         CloudFolderReader().open(tmp_path).frames[0].read_points()

@@ -42,7 +42,7 @@ def ahead_left_up(points: np.ndarray) -> np.ndarray:
     return np.column_stack([points[:, 2], -points[:, 0], points[:, 1]]) / 100
 
 
-@pytest.mark.parametrize("head", ["", "3 x 1\n", "2\n"])
+@pytest.mark.parametrize("head", ["", "3 x 1\n", "2\n", "# a comment\n"])
 def test_scans_of_3dtk_lie_as_3dtk_lays_them(tmp_path: Path, head: str) -> None:
     source = check_reader(CloudFolderReader(), uos(tmp_path, head))
     first, second = (frame.read_points().points_in_cam for frame in source.frames)
@@ -81,8 +81,8 @@ def test_points_of_vtk(tmp_path: Path, kind: bytes, number: str) -> None:
     [
         ("a.3d", b"", "no rows of x, y and z"),
         ("a.3d", b"3 x 1\n1 2\n", "no rows of x, y and z"),
-        ("a.3d", b"1 2 3\n4 5\n", "no rows of 3 numbers|says 2 points"),
-        ("a.3d", b"1 2 3\n4 5 hello\n", "no rows of 3 numbers"),
+        ("a.3d", b"1 2 3\n4 5\n", "point 2, `4 5`, is no row of 3 numbers"),
+        ("a.3d", b"1 2 3\n4 5 hello\n", "point 2, `4 5 hello`, is no row of 3 numbers"),
         ("a.vtk", b"", "no legacy VTK file"),
         ("a.vtk", b"<VTKFile type='PolyData'>", "no legacy VTK file"),
         ("a.vtk", VTK % b"ASCII" + b"LINES 1 2\n", "no legacy VTK file"),

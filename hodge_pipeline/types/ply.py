@@ -39,7 +39,8 @@ FACE_PROPERTY = "list uchar int vertex_indices"
 @dataclass(frozen=True)
 class PlyHeader:
     """Where the vertices lie: `count` records of `properties` (name, type) after `start` bytes and `lines` lines; how
-    many `triangles` of ours follow, None where there is another element or none; the comments.
+    many `triangles` of ours follow, None where there is another element or none; the comments; whether no element
+    follows.
     """
 
     order: str
@@ -49,6 +50,7 @@ class PlyHeader:
     lines: int
     triangles: int | None
     comments: tuple[str, ...]
+    is_last: bool
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -100,12 +102,14 @@ def _vertices(path: Path, order: str, elements: list[_Element], start: int, comm
     lines = 0
     for row, element in enumerate(elements):
         if element.name == "vertex":
-            if element.declared or len({name for name, _ in element.properties}) < len(element.properties):
-                raise SourceError(f"{path}: its vertices hold lists or a property twice: write plain points")
+            names = {name for name, _ in element.properties}
+            if element.declared or not names or len(names) < len(element.properties):
+                raise SourceError(f"{path}: its vertices hold lists, nothing or a property twice: write plain points")
             after = elements[row + 1 :]
             ours = len(after) == 1 and after[0].name == "face" and after[0].declared == [FACE_PROPERTY]
             triangles = after[0].count if ours and len(after[0].properties) == 1 else None
-            return PlyHeader(order, element.count, tuple(element.properties), start, lines, triangles, comments)
+            properties = tuple(element.properties)
+            return PlyHeader(order, element.count, properties, start, lines, triangles, comments, not after)
         if element.declared and order:
             raise SourceError(f"{path}: {element.name} with lists lies before the vertices: write the vertices first")
         start += element.count * sum(np.dtype(kind).itemsize for _, kind in element.properties) if order else 0

@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_adapters.text_rows import to_floats
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bools, Bytes, Floats, Floats32, PointCloud
 from hodge_pipeline.types.positions import whole_kilometres
@@ -22,6 +23,7 @@ TIMES = ("t", "time", "timestamp", "time_stamp", "offset_time")
 """When a point was measured: Ouster, Velodyne, Hesai and Livox name it differently, and count in their own units."""
 REVOLUTION_S = (0.01, 2.0)
 """A spinning scanner's: it tells seconds from milli-, micro- and nanoseconds."""
+NAMES = frozenset((*"xyz", *COLOURS, *PACKED, *TIMES, *NORMALS[0], *NORMALS[1]))
 MAX_METRES = 1e9
 ROWS_IN_PART, LINES_IN_PART = 1 << 20, 1 << 17
 Columns: TypeAlias = Mapping[str, Any]
@@ -92,7 +94,16 @@ def unpacked(columns: dict[str, Any]) -> dict[str, Any]:
         return columns
     words = np.ascontiguousarray(columns[packed])
     words = words.view(np.dtype("u4").newbyteorder(words.dtype.byteorder))
-    return columns | {"red": words >> 16 & 255, "green": words >> 8 & 255, "blue": words & 255}
+    return columns | {name: (words >> by & 255).astype(np.uint8) for name, by in zip(COLOURS, (16, 8, 0), strict=True)}
+
+
+def as_declared(column: Floats, code: str) -> NDArray[Any]:
+    """A column of numbers that were text, in the type that its header declares; what that has no room for is cut."""
+    kind = np.dtype(code)
+    with np.errstate(over="ignore", invalid="ignore"):
+        if kind.kind in "iu":
+            column = np.clip(column, np.iinfo(kind).min, np.iinfo(kind).max)
+        return np.ascontiguousarray(column.astype(kind))
 
 
 def seconds_after_first(times: Floats, returned: Bools) -> tuple[Floats32 | None, float]:
@@ -116,17 +127,32 @@ def number_rows(path: Path, lines: Iterable[bytes], count: int, width: int) -> I
     """
     left, found = iter(lines), 0
     while found < count or not found:
-        wanted = min(LINES_IN_PART, count - found)
+        part = list(islice(left, wanted := min(LINES_IN_PART, count - found)))
         try:
-            table = np.array(b" ".join(islice(left, wanted)).split(), np.float64).reshape(-1, width or 1)
+            table = np.array(b" ".join(part).split(), np.float64).reshape(-1, width or 1)
         except ValueError as error:
-            raise SourceError(f"{path}: its points are no rows of {width} numbers: make it again") from error
-        found += len(table)
+            raise _wrong_row(path, part, found, width) from error
         if len(table) != wanted:
-            raise SourceError(f"{path}: says {count} points, has {found}: copy it again")
+            if len(part) == wanted:
+                raise _wrong_row(path, part, found, width)
+            raise SourceError(f"{path}: says {count} points, has {found + len(table)}: copy it again")
+        found += len(table)
         yield table
         if not count:
             return
+
+
+def refuse_more(path: Path, lines: Iterable[bytes], count: int) -> None:
+    """Raise `SourceError` where lines are left after those of `count` points."""
+    if rest := sum(1 for _ in lines):
+        raise SourceError(f"{path}: says {count} points, has {count + rest}: copy it again")
+
+
+def _wrong_row(path: Path, part: list[bytes], before: int, width: int) -> SourceError:
+    """The error that names the first line of a part which is no row of `width` numbers."""
+    texts = ((row, line.decode("utf-8", "replace").split()) for row, line in enumerate(part, before + 1))
+    row, words = next((row, words) for row, words in texts if len(words) != width or to_floats(words) is None)
+    return SourceError(f"{path}: point {row}, `{' '.join(words)[:60]}`, is no row of {width} numbers: mend its line")
 
 
 def parts_of(columns: Columns) -> Iterator[dict[str, Any]]:
@@ -165,14 +191,14 @@ def _raw_colours(columns: Columns, finite: Bools) -> NDArray[Any]:
     values = np.column_stack([columns[name] for name in COLOURS])[finite]
     if values.dtype.kind == "f":
         return values.astype(np.float32)
-    return values if values.dtype == np.uint16 else np.clip(values, 0, 255).astype(np.uint8)
+    return values if values.dtype == np.uint8 else np.clip(values, 0, 65535).astype(np.uint16)
 
 
 def _eight_bits(values: NDArray[Any]) -> Bytes:
     if values.dtype == np.uint8:
         return values
     largest = np.nanmax(values) if values.size else 0
-    if values.dtype == np.uint16 and largest > 255:
+    if largest >= 256:
         values = values // 257
     elif values.dtype.kind == "f" and largest <= 1:
         values = values * np.float32(255)

@@ -4,14 +4,23 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hodge_adapters.clouds.columns import PACKED, number_rows, parts_of, points_of_parts, unpacked
+from hodge_adapters.clouds.columns import (
+    COLOURS,
+    PACKED,
+    as_declared,
+    number_rows,
+    parts_of,
+    points_of_parts,
+    refuse_more,
+    unpacked,
+)
 from hodge_adapters.text_rows import reading
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import PointCloud
@@ -104,10 +113,10 @@ def _read_header(path: Path, contents: bytes) -> PcdHeader:
             entries[words[0]] = words[1:]
     names, sizes, kinds = (entries.get(key, []) for key in ("FIELDS", "SIZE", "TYPE"))
     counts = entries.get("COUNT") or ["1"] * len(names)
-    points = entries.get("POINTS") or ["?"]
+    points = entries.get("POINTS") or [_product(entries)]
     data = " ".join(entries["DATA"])
     sound = names and len(names) == len(sizes) == len(kinds) == len(counts) and len(points) == 1
-    sound = sound and all(_is_count(word, 9999) for word in counts) and _is_count(points[0], 1 << 40)
+    sound = sound and all(_is_count(word, 9999) and int(word) for word in counts) and _is_count(points[0], 1 << 40)
     good = sound and all(_is_type(kind, size) for kind, size in zip(kinds, sizes, strict=True))
     if not good or data not in ("ascii", "binary", "binary_compressed"):
         raise SourceError(
@@ -118,6 +127,13 @@ def _read_header(path: Path, contents: bytes) -> PcdHeader:
         for row, (name, kind, size, count) in enumerate(zip(names, kinds, sizes, counts, strict=True))
     ]
     return PcdHeader(tuple(fields), int(points[0]), data, at)
+
+
+def _product(entries: Mapping[str, list[str]]) -> str:
+    """WIDTH times HEIGHT, `?` where they are no counts."""
+    sides = [*entries.get("WIDTH", []), *entries.get("HEIGHT", [])]
+    sound = len(sides) == 2 and all(_is_count(side, 1 << 40) for side in sides)
+    return str(int(sides[0]) * int(sides[1])) if sound else "?"
 
 
 def _is_count(word: str, limit: int) -> bool:
@@ -138,16 +154,10 @@ def _read_ascii(path: Path, contents: bytes, header: PcdHeader) -> Iterator[dict
         for name, code, count in header.fields:
             column = table[:, at]
             # Packed colours are the bits of the number that is written.
-            columns[name] = _as_type(column, code) if name in PACKED else column
+            columns[name] = as_declared(column, code) if name in (*PACKED, *COLOURS) else column
             at += count
         yield columns
-    if rest := sum(1 for _ in lines):
-        raise SourceError(f"{path}: says {header.count} points, has {header.count + rest}: copy it again")
-
-
-def _as_type(column: Any, code: str) -> Any:
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.ascontiguousarray(column.astype(code))
+    refuse_more(path, lines, header.count)
 
 
 def _read_binary(path: Path, contents: bytes, header: PcdHeader) -> Iterator[dict[str, Any]]:

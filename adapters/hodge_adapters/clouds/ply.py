@@ -7,7 +7,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from hodge_adapters.clouds.columns import number_rows, points_of_parts
+from hodge_adapters.clouds.columns import as_declared, number_rows, points_of_parts, refuse_more
 from hodge_adapters.text_rows import reading, write_bytes_atomically
 from hodge_pipeline.types import Model, PointCloud
 from hodge_pipeline.types.input_files import open_input
@@ -54,6 +54,12 @@ def _ascii_parts(path: Path, file: BinaryIO, header: PlyHeader) -> Iterator[dict
     file.seek(header.start)
     for _ in islice(file, header.lines):
         pass
-    names = [COLOURS.get(name, name) for name, _ in header.properties]
-    for table in number_rows(path, file, header.count, len(names)):
-        yield dict(zip(names, table.T, strict=True))
+    lines = filter(bytes.strip, file)
+    for table in number_rows(path, lines, header.count, len(header.properties)):
+        columns = {}
+        for (name, code), column in zip(header.properties, table.T, strict=True):
+            called = COLOURS.get(name, name)
+            columns[called] = as_declared(column, code) if called in COLOURS.values() else column
+        yield columns
+    if header.is_last:
+        refuse_more(path, lines, header.count)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hodge_adapters.clouds.columns import points_of_parts
-from hodge_adapters.clouds.tables import fields_of, row_parts
+from hodge_adapters.clouds.tables import fields_of, is_row, row_parts
 from hodge_adapters.text_rows import first_text, read_rows, to_floats
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -26,7 +26,8 @@ def read_uos(path: Path) -> PointCloud:
     """The points in metres, x ahead, y left, z up: the first three numbers of each row (reflectances, colours and
     normals, which nothing tells apart, are left). A first line that is no row of numbers is a header.
     """
-    first, second = (*first_text(path).lstrip().splitlines()[:2], "", "")[:2]
+    rows = [line for line in first_text(path).splitlines() if is_row(line.encode())]
+    first, second = (*rows[:2], "", "")[:2]
     header = len(to_floats(fields_of(first)) or ()) < 3
     width = len(fields_of(second if header else first))
     if width < 3:
