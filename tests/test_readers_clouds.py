@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -119,6 +120,27 @@ def test_a_folder_with_poses_and_pairs(tmp_path: Path) -> None:
     assert any("1 of 3 fragments have no pose: cloud_bin_10.ply" in note for note in source.notes)
     scaled = CloudFolderReader(units_per_metre=1000.0).open(folder).frames[0].read_points()
     np.testing.assert_allclose(scaled.points_in_cam * 1000, cloud(seed=0).points_in_cam, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("logs", "posed", "note"),
+    [
+        ({"a.log": "2024-01-01 started\nsensor ready\n"}, 0, "a.log: left out: begins with no block"),
+        ({"a.log": "2024-01-01 started\n", "b.log": "poses"}, 1, "a.log: left out: begins with no block"),
+        (
+            {"a.log": "# of a scanner\npose", "b.log": "pose"},
+            0,
+            "2 .log files, none taken: option log names one of a.log, b.log",
+        ),
+    ],
+)
+def test_logs_that_are_not_taken_are_told(tmp_path: Path, logs: dict[str, str], posed: int, note: str) -> None:
+    folder = fragments(tmp_path / "f", 2)
+    for name, text in logs.items():
+        (folder / name).write_text(re.sub("poses?", log_block(0, 0, np.eye(4)), text))
+    source = CloudFolderReader().open(folder)
+    assert sum(frame.world_from_cam is not None for frame in source.frames) == posed
+    assert any(told.startswith(note) for told in source.notes)
 
 
 def test_one_cloud_of_all_fragments(tmp_path: Path) -> None:

@@ -59,8 +59,13 @@ def read_text(path: Path) -> str:
 
 
 def read_rows(path: Path) -> list[Row]:
+    """The rows of a file; see `rows_of`."""
+    return rows_of(read_text(path))
+
+
+def rows_of(text: str) -> list[Row]:
     """The lines that hold anything but a `#` comment, cut at blanks, tabs and commas."""
-    lines = read_text(path).splitlines()
+    lines = text.splitlines()
     cut = (Row(number, line.split("#", 1)[0].replace(",", " ").split()) for number, line in enumerate(lines, 1))
     return [row for row in cut if row.fields]
 

@@ -21,7 +21,7 @@ from hodge_adapters.clouds.tables import names_points
 from hodge_adapters.clouds.uos import POSE, pose_file
 from hodge_adapters.posed import left_out, posed_frames, written
 from hodge_adapters.text_rows import listed, natural
-from hodge_adapters.trajectories.log import read_log_file
+from hodge_adapters.trajectories.log import begins_as_log, read_log_file
 from hodge_adapters.trajectories.text import unit_of
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -44,7 +44,7 @@ class CloudFolderReader:
     log: str = Field(
         "auto",
         description="Redwood .log in the folder: blocks `i i n` are poses, `i j n` measured pairs; auto: the only one "
-        "there; empty: none",
+        "there that begins as one; empty: none",
     )
     units_per_metre: float = Field(1.0, gt=0, description="stored units per metre; 1000 for millimetres")
     every: int = Field(1, ge=1, description="take every n-th fragment")
@@ -86,7 +86,7 @@ class CloudFolderReader:
         numbers = [float(row) for row in range(len(stems))] if scanners else _numbers(stems, notes)
         order = np.argsort(numbers, kind="stable")
         fragments, numbers = [fragments[row] for row in order], [numbers[row] for row in order]
-        log = self._log(path if path.is_dir() else path.parent) if path.is_dir() or self.log != "auto" else None
+        log = self._log(path if path.is_dir() else path.parent, notes) if path.is_dir() or self.log != "auto" else None
         parsed = read_log_file(log) if log else None
         poses: Mapping[float, Floats] = dict(parsed.poses.items()) if parsed else {}
         beside = tuple(filter(None, [log, *(pose_file(file) for file in files)]))
@@ -154,13 +154,18 @@ class CloudFolderReader:
         )
         return KITTI_RAISE_DEG
 
-    def _log(self, folder: Path) -> Path | None:
+    def _log(self, folder: Path, notes: list[str]) -> Path | None:
         if not self.log:
             return None
         if self.log != "auto":
             return folder / self.log
-        logs = sorted(folder.glob("*.log"))
-        return logs[0] if len(logs) == 1 else None
+        found = set(folder.glob("*.log"))
+        logs = {file for file in found if begins_as_log(file)}
+        if others := found - logs:
+            notes.append(f"{_listed(others)}: left out: begins with no block of a Redwood .log (option log names one)")
+        if len(logs) > 1:
+            notes.append(f"{len(logs)} .log files, none taken: option log names one of {_listed(logs)}")
+        return logs.pop() if len(logs) == 1 else None
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

@@ -11,7 +11,7 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters.posed import written
-from hodge_adapters.text_rows import read_rows, write_text_atomically
+from hodge_adapters.text_rows import Row, first_text, read_rows, rows_of, to_floats, write_text_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
@@ -49,6 +49,12 @@ def read_log_file(path: Path) -> LogFile:
         raise SourceError(f"{path}: a pose is given twice: remove one of its blocks")
     poses = {int(number): pose for number, pose in zip(numbers[own, 0], body[own], strict=True)}
     return LogFile(poses, numbers[~own, :2], body[~own], numbers[~own, 2])
+
+
+def begins_as_log(path: Path) -> bool:
+    """Whether the first lines of a file are numbers, `i j n` and a row of four."""
+    head, row = (*rows_of(first_text(path)), Row(0, []), Row(0, []))[:2]
+    return to_floats(head.fields[:3] + row.fields) is not None and len(head.fields) > 1 and len(row.fields) == 4
 
 
 def read_blocks(path: Path, size: int) -> tuple[Ints, Floats, list[int]]:
