@@ -217,6 +217,16 @@ def test_topics_by_type_and_by_option(tmp_path: Path) -> None:
         McapReader(frames="points").open(path)
 
 
+def test_infrared_of_16_bits_is_no_depth_where_there_is_some(tmp_path: Path) -> None:
+    log = depth_log(some_images(2))
+    for row in range(3):
+        log.add(
+            "/cam/ir", RAW, {**foxglove_header(100 + row / 10, OPTICAL), **raw_image(depth_values(row), "mono16")}, CDR
+        )
+    notes = McapReader().open(log.write(tmp_path / "log.mcap")).notes
+    assert f"depth of {DEPTH} taken, not of /cam/ir: see option depth_topic" in notes
+
+
 def test_an_uncalibrated_camera_is_said_to_be_one(tmp_path: Path) -> None:
     log = depth_log(some_images())
     zero = {**foxglove_header(100, OPTICAL), **calibration(WIDTH, HEIGHT, 0, 0, 0, 0)}

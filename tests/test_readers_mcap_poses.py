@@ -163,3 +163,37 @@ def test_topics_and_transforms_are_listed_with_counts_and_rates(tmp_path: Path) 
         "tf map -> odom: 1 pose",
     )
     assert inspect(tmp_path / "log.mcap")["contents"] == list(contents)
+
+
+def test_a_bad_transform_is_left_out_alone(tmp_path: Path) -> None:
+    log, poses = depth_log(some_images(2)), some_poses(2)
+    for row, pose in enumerate(poses):
+        both = transforms((100 + row / 10, "map", "bad", pose), (100 + row / 10, "map", OPTICAL, pose))
+        both["transforms"][0]["transform"]["rotation"] = dict.fromkeys("xyzw", 0.0)
+        log.add("/tf", "tf2_msgs/msg/TFMessage", both, CDR)
+    source = McapReader().open(log.write(tmp_path / "log.mcap"))
+    np.testing.assert_allclose([frame.world_from_cam for frame in source.frames], poses, atol=1e-9)
+    assert "/tf: 2 left out: a transform with a pose that is no rigid motion" in source.notes
+
+
+def test_poses_out_of_order_and_with_one_stamp_are_told(tmp_path: Path) -> None:
+    log, poses = Log(), some_poses(5)
+    for stamp, pose in zip((100, 101, 101, 50, 102), poses, strict=True):
+        log.add("/odom", "nav_msgs/msg/Odometry", odometry(stamp, pose), CDR)
+    source = McapReader().open(log.write(tmp_path / "log.mcap"))
+    np.testing.assert_allclose(source.trajectory.world_from_cam, poses[[3, 0, 1, 4]], atol=1e-9)
+    assert "/odom: 1 pose with the stamp of an earlier one left out" in source.notes
+    assert "/odom: poses were not in order of time: sorted" in source.notes
+
+
+@pytest.mark.parametrize("again", [0, 1])
+def test_of_static_transforms_the_last_one_sent_holds(tmp_path: Path, again: int) -> None:
+    log, poses = depth_log(some_images(2)), some_poses(4)
+    for stamp, link in ((200, poses[2]), (50, poses[2 + again])):
+        log.add("/tf_static", "tf2_msgs/msg/TFMessage", transforms((stamp, "base", OPTICAL, link)), CDR)
+    for row, pose in enumerate(poses[:2]):
+        log.add("/tf", "tf2_msgs/msg/TFMessage", transforms((100 + row / 10, "map", "base", pose)), CDR)
+    source = McapReader().open(log.write(tmp_path / "log.mcap"))
+    expected = poses[:2] @ poses[2 + again]
+    np.testing.assert_allclose([frame.world_from_cam for frame in source.frames], expected, atol=1e-9)
+    assert ("1 static transform replaced by a later, other one" in source.notes) == bool(again)

@@ -69,7 +69,9 @@ def _from_topic(
 ) -> Poses:
     topic = recording.poses[name]
     body = options.child or topic.child
-    trajectory = topic.poses.trajectory()
+    parsed = topic.poses.ordered()
+    trajectory = parsed.trajectory
+    notes += [f"{name}: {note}" for note in parsed.notes]
     of_frames = se3.poses_at(trajectory, stamps_s, options.max_gap_s)
     if not len(stamps_s):
         notes.append(f"trajectory of {body or 'what it moves'} in {topic.frame or 'its world'} from {name}")

@@ -92,6 +92,8 @@ class McapReader:
         notes += filter(None, [recording.clock_note()])
         if recording.transforms.other_parents:
             notes.append(f"{recording.transforms.other_parents} transforms of frames with two parents left out")
+        if recording.transforms.replaced:
+            notes.append(f"{counted(recording.transforms.replaced, 'static transform')} replaced by a later, other one")
         frames, camera_frame = self._frames(path, recording, notes)
         frames = frames[:: self.every]
         stamps_s = np.array([frame.stamp_s for frame in frames], float)

@@ -220,18 +220,25 @@ def _add_fix(recording: Recording, message: Message, path: Path, logged: Logged)
 
 
 def _add_transforms(recording: Recording, message: Message, path: Path, logged: Logged) -> None:
-    is_static = logged.channel.topic.endswith("tf_static")
     for transform in parts(message, "transforms") if "transforms" in message else [message]:
-        # A Foxglove transform is flat, a ROS one has its motion in a message of its own.
-        motion = part(transform, "transform") if "transform" in transform else transform
-        values = pose_values(part(motion, "translation"), part(motion, "rotation"))
-        parent = text(transform, "parent_frame_id").lstrip("/") or frame_id(transform)
-        child = text(transform, "child_frame_id").lstrip("/")
-        if not child or parent == child:
-            raise Malformed("a transform between no two frames")
-        # A static transform may have been sent long before, by another clock, or without a stamp: it does not matter.
-        stamp = stamp_s(transform) if is_static else recording.stamp(transform, logged)
-        recording.transforms.add(parent, child, stamp, values, is_static=is_static)
+        try:
+            _add_transform(recording, transform, logged)
+        except Malformed as error:
+            recording.complaints.count(logged.channel.topic, f"a transform with {error}")
+
+
+def _add_transform(recording: Recording, transform: Message, logged: Logged) -> None:
+    is_static = logged.channel.topic.endswith("tf_static")
+    # A Foxglove transform is flat, a ROS one has its motion in a message of its own.
+    motion = part(transform, "transform") if "transform" in transform else transform
+    values = pose_values(part(motion, "translation"), part(motion, "rotation"))
+    parent = text(transform, "parent_frame_id").lstrip("/") or frame_id(transform)
+    child = text(transform, "child_frame_id").lstrip("/")
+    if not child or parent == child:
+        raise Malformed("fewer than two frames")
+    # A static transform may have been sent long before, by another clock, or without a stamp: it does not matter.
+    stamp = stamp_s(transform) if is_static else recording.stamp(transform, logged)
+    recording.transforms.add(parent, child, stamp, values, is_static=is_static)
 
 
 def _images(recording: Recording) -> dict[str, list[Seen[ImageLayout]]]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from hodge_adapters.trajectories.text import ParsedTrajectory, ordered
 from hodge_pipeline import se3
 from hodge_pipeline.types import Floats, Trajectory
 from hodge_pipeline.types.text import counted
@@ -26,19 +27,16 @@ class PoseColumns:
     def __len__(self) -> int:
         return len(self.numbers) // 8
 
-    def trajectory(self) -> Trajectory:
-        """The poses by stamp; of several with one stamp the first."""
-        rows = np.frombuffer(self.numbers, float).reshape(-1, 8) if len(self) else np.zeros((0, 8))
-        stamps_s, first = np.unique(rows[:, 0], return_index=True)
-        rows = rows[first]
-        poses = se3.from_quat_xyzw(rows[:, 1:4], rows[:, 4:]) if len(rows) else np.zeros((0, 4, 4))
-        return Trajectory(stamps_s, poses)
+    def ordered(self) -> ParsedTrajectory:
+        """The poses by stamp, of several with one stamp the first, and what of them was not in order."""
+        return ordered(np.array(self.numbers).reshape(-1, 8))
 
 
 class TransformTree:
     """Each coordinate frame's motion in its parent's, looked up at any time.
 
-    A link that was sent on a static topic, or only once, holds at all times; others are interpolated.
+    A link that was sent on a static topic, or only once, holds at all times, with the value sent last; others are
+    interpolated.
     """
 
     def __init__(self, max_gap_s: float) -> None:
@@ -49,6 +47,8 @@ class TransformTree:
         self._trajectories: dict[str, Trajectory] = {}
         self.other_parents = 0
         """How many transforms were left out since their frame had another parent before."""
+        self.replaced = 0
+        """How many static transforms another one of the same link replaced, as tf2 has it."""
 
     def contents(self) -> tuple[str, ...]:
         """Its links, a line each, parents before children where the links form a tree."""
@@ -64,7 +64,10 @@ class TransformTree:
             self.other_parents += 1
             return
         if is_static:
+            self.replaced += child in self._static and self._links[child].numbers[1:].tolist() != list(pose)
             self._static.add(child)
+        if child in self._static:
+            self._links[child] = PoseColumns()
         self._links.setdefault(child, PoseColumns()).add(stamp_s, pose)
 
     def __contains__(self, frame: str) -> bool:
@@ -113,5 +116,5 @@ class TransformTree:
 
     def _link(self, frame: str) -> Trajectory:
         if frame not in self._trajectories:
-            self._trajectories[frame] = self._links[frame].trajectory()
+            self._trajectories[frame] = self._links[frame].ordered().trajectory
         return self._trajectories[frame]

@@ -58,12 +58,15 @@ def split_depth(images: ImageTopics, notes: list[str]) -> tuple[ImageTopics, Ima
 
 
 def best_depth(depth: ImageTopics, colour: ImageTopics, notes: list[str]) -> str:
-    """The depth topic that lies on a colour image's grid, else the one with most images."""
+    """The depth topic that lies on a colour image's grid, else the one with most images; one of mono16, as infrared
+    images are, where there is no other.
+    """
 
-    def rank(topic: str) -> tuple[bool, int, bool, str]:
+    def rank(topic: str) -> tuple[bool, bool, int, bool, str]:
         first = depth[topic][0]
         registered = any(_shares_grid(first, other[0]) for other in colour.values())
-        return not registered, -len(depth[topic]), first.layout.coding == "rvl", topic
+        grey = first.layout.encoding == "mono16"
+        return grey, not registered, -len(depth[topic]), first.layout.coding == "rvl", topic
 
     ranked = sorted(depth, key=rank)
     if len(ranked) > 1:
