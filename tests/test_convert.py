@@ -83,6 +83,19 @@ def test_what_is_there_is_replaced_only_when_asked_to(tmp_path: Path, capsys: py
         convert(sequence, tmp_path / "file/poses.tum")
 
 
+def test_notes_are_one_line_each_and_come_before_what_a_writer_refuses(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tum = tmp_path / "a.tum"
+    tum.write_text(tum_line(1.5, np.eye(4)) + "no pose\n")
+    with pytest.raises(HodgeError, match="no graph"):
+        convert(tum, tmp_path / "a.g2o", reader="tum_poses")
+    assert capsys.readouterr().out == "note: a.tum: 1 line that is no pose left out: 2\n"
+    (tmp_path / "a\nb.tum").write_text(tum.read_text())
+    convert(tmp_path / "a\nb.tum", tmp_path / "a.kitti", reader="tum_poses")
+    assert "note: a\\nb.tum: 1 line" in capsys.readouterr().out
+
+
 def test_the_ninth_column_of_rtabmap_is_read(tmp_path: Path) -> None:
     path = tmp_path / "poses.txt"
     path.write_text(

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import shutil
 import sqlite3
 import subprocess
@@ -12,6 +13,7 @@ import pycolmap
 import pytest
 
 from hodge_adapters.colmap.cameras import pinhole_camera, undistortion
+from hodge_adapters.colmap.files import by_report
 from hodge_adapters.colmap.reader import ColmapReader
 from hodge_adapters.colmap.records import CameraRecord
 from hodge_adapters.colmap.writer import ColmapWriter
@@ -102,9 +104,45 @@ def test_undistortion_puts_every_ray_where_the_pinhole_says(model: str) -> None:
     np.testing.assert_allclose(back[0], ray[0, :2], atol=1e-6)
 
 
-def test_a_panorama_is_refused() -> None:
-    with pytest.raises(SourceError, match="panorama, .* rig .*colmap bundle_adjuster"):
-        pinhole_camera(CameraRecord(1, "EQUIRECTANGULAR", 64, 32, (64.0, 32.0)), (64, 32))
+def text_model(folder: Path, camera: str = "1 PINHOLE 8 6 10 10 4 3", name: str = "a.png") -> Path:
+    """A model of one image in text."""
+    folder.mkdir(parents=True)
+    (folder / "cameras.txt").write_text(camera + "\n")
+    (folder / "images.txt").write_text(f"1 1 0 0 0 0 0 0 1 {name}\n\n")
+    (folder / "points3D.txt").write_text("")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        ("1 EQUIRECTANGULAR 64 32 64 32", "model: camera 1: .* panorama, .* rig .*colmap bundle_adjuster"),
+        ("1 MEI 64 48 50 50 32 24", r"cameras.txt:1: has a camera of the unknown model MEI"),
+        ("1 PINHOLE 64 48 50 x 32 24", r"cameras.txt:1: .*expected numbers"),
+    ],
+)
+def test_cameras_that_are_refused_are_named(tmp_path: Path, camera: str, message: str) -> None:
+    with pytest.raises(SourceError, match=message):
+        ColmapReader().open(text_model(tmp_path / "model", camera))
+
+
+@pytest.mark.parametrize("name", [".", "/", "..", "a/.."])
+def test_an_image_without_a_name_has_no_depth(tmp_path: Path, name: str) -> None:
+    (tmp_path / "depth").mkdir()
+    source = ColmapReader(edges="none").open(text_model(tmp_path / "model", name=name))
+    assert source.frames[0].read_depth is None and any("not there as files" in note for note in source.notes)
+
+
+def test_what_a_report_leads_to_is_told(tmp_path: Path) -> None:
+    model, far = text_model(tmp_path / "refined/sparse/0"), tmp_path / "far/away"
+    (tmp_path / "refined/refinement").mkdir()
+    (tmp_path / "refined/report.json").write_text(json.dumps({"source": {"path": str(far / "from/it")}}))
+    (far / "images").mkdir(parents=True)
+    for found in (far / "images", far / "database.db"):
+        assert by_report(model, found)[0].startswith(f"{found}: taken, since the report.json of this model")
+    assert by_report(model, far / "images")[0] in ColmapReader().open(model).notes
+    (far / "images").rename(tmp_path / "images")
+    assert not any("report.json" in note for note in ColmapReader().open(model).notes), "above the model"
 
 
 def posed_source(folder: Path, count: int = 4) -> Source:

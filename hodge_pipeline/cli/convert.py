@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from hodge_pipeline import registry
+from hodge_pipeline.cli.guard import shown
 from hodge_pipeline.cli.paths import keep_source
 from hodge_pipeline.cli.reader_choice import choose_reader
 from hodge_pipeline.errors import RecipeError, not_written
@@ -65,9 +66,11 @@ def convert(
         raise not_written(out, NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))) from error
     except OSError as error:
         raise not_written(out, error) from error
+    for note in opened.notes:
+        print(f"note: {shown(note)}")
     what, *lost = writer.write(out, opened) or ("",)
-    for note in (*opened.notes, *lost):
-        print(f"note: {note}")
+    for note in lost:
+        print(f"note: {shown(note)}")
     print(f"{out}: written as {name}{what and ': '}{what}")
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hodge_pipeline import registry
+from hodge_pipeline.cli.guard import shown
 from hodge_pipeline.errors import HodgeError, RecipeError
 from hodge_pipeline.types.text import command
 
@@ -70,7 +71,7 @@ def _words(value: Any) -> str:
         return ", ".join(f"{key} {_words(item)}" for key, item in value.items())
     if isinstance(value, list):
         return "  ".join(_words(item) for item in value)
-    return f"{value:.6g}" if isinstance(value, float) and abs(value) < 1e6 else str(value)
+    return f"{value:.6g}" if isinstance(value, float) and abs(value) < 1e6 else shown(str(value))
 
 
 def stages(kind: str | None) -> None:

@@ -40,6 +40,8 @@ def check_words(paths: Sequence[Path]) -> None:
     for path in paths:
         for line, text in text_lines(path):
             words = text.split(maxsplit=9)[:9] if path.stem == "images" and _is_pose(text) else text.split()
+            if path.stem == "cameras" and words[1] not in _CAMERA_MODELS:
+                raise SourceError(f"{path}:{line}: has a camera of the unknown model {words[1][:60]}: {REMEDY}")
             numbers = [word for word in words if word not in _SENSORS and word not in _CAMERA_MODELS]
             if numbers and not np.isfinite(to_floats(numbers) or np.nan).all():
                 raise _fault(path, line, text, "numbers")

@@ -48,6 +48,8 @@ def stereo_depth(folder: Path, name: str) -> Path | None:
 def sensor_depth(folder: Path, name: str, colour: Path | None) -> Path | None:
     """The depth image of a colour image: of the same name as PNG, or with `depth` for `color` in it."""
     pure = Path(name)
+    if not pure.name:
+        return None
     own = inside(colour, name) if colour else None
     names = [pure.with_suffix(".png"), Path(f"{name}.png")]
     for word, depth in _DEPTH_NAMES:

@@ -78,6 +78,13 @@ def find_images(model: Path, given: str) -> Path | None:
     return found or next((place / name for place in places for name in IMAGE_FOLDERS if (place / name).is_dir()), None)
 
 
+def by_report(model: Path, found: Path | None) -> list[str]:
+    """A note where a folder or a database lies not beside or above a model but where its `report.json` points."""
+    if found is None or found.parent in _above(model):
+        return []
+    return [f"{found}: taken, since the report.json of this model says that it was refined from one near there"]
+
+
 def _above(model: Path) -> list[Path]:
     return [model, *model.absolute().parents[:PARENTS]]
 

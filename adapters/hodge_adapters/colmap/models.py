@@ -14,7 +14,7 @@ from hodge_adapters.colmap.bundle import Intrinsics
 from hodge_adapters.colmap.content import checked_content, read_model
 from hodge_adapters.colmap.database import database_names, has_verified_pairs
 from hodge_adapters.colmap.depth import sensor_depth
-from hodge_adapters.colmap.files import find_database, find_models, largest_model, model_ending, no_model
+from hodge_adapters.colmap.files import by_report, find_database, find_models, largest_model, model_ending, no_model
 from hodge_adapters.colmap.priors import database_priors, table_priors
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.reader import ColmapReader
@@ -158,6 +158,7 @@ class ColmapModels:
             return None
         if self.database == "auto":
             found = find_database(folder)
+            notes += by_report(folder, found)
         else:
             found = next((path for path in (Path(self.database), folder / self.database) if path.is_file()), None)
             if found is None:

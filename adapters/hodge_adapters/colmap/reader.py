@@ -25,6 +25,7 @@ from hodge_adapters.colmap.database import database_pairs
 from hodge_adapters.colmap.depth import depth_map_size, sensor_depth, stereo_depth
 from hodge_adapters.colmap.edges import Pair, covisible_pairs, measured_graph
 from hodge_adapters.colmap.files import (
+    by_report,
     find_database,
     find_folder,
     find_images,
@@ -123,6 +124,8 @@ class ColmapReader:
         """The source that a model of this folder is, with what lies beside it; `path` is what the user gave."""
         notes = list(model.notes)
         colour_folder = find_images(folder, self.images)
+        if self.images == "auto":
+            notes += by_report(folder, colour_folder)
         depths = self._depths(folder, colour_folder, model)
         readable = {row: file for row, file in enumerate(depths) if file}
         if self.depth != "none" and 0 < len(readable) < len(depths):
@@ -130,12 +133,15 @@ class ColmapReader:
         scale = self._scale(model, depths, notes)
         poses = scaled_poses(np.array([image.world_from_cam for image in model.images]), scale)
         sizes = _sizes(model, depths)
-        frames = tuple(
-            self._frame(
-                row, image, model.cameras[image.camera_id], poses[row], colour_folder, depths[row], sizes, scale
+        try:
+            frames = tuple(
+                self._frame(
+                    row, image, model.cameras[image.camera_id], poses[row], colour_folder, depths[row], sizes, scale
+                )
+                for row, image in enumerate(model.images)
             )
-            for row, image in enumerate(model.images)
-        )
+        except SourceError as error:
+            raise SourceError(f"{folder}: {error}") from error
         lost = [frame.frame_id for frame in frames if frame.read_colour is None]
         if lost:
             advice = "" if colour_folder else ": images=FOLDER names where they are"
@@ -234,6 +240,7 @@ class ColmapReader:
                 raise SourceError(
                     f"{folder}: no database.db beside or above it: put it there, or set edges=covisibility"
                 )
+            notes += by_report(folder, database)
             pairs = database_pairs(database, model, self.min_shared, notes)
         graph = measured_graph(model, pairs, self.min_shared // 2, self.seed, notes)
         notes.append(
