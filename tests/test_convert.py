@@ -94,6 +94,8 @@ def test_notes_are_one_line_each_and_come_before_what_a_writer_refuses(
     (tmp_path / "a\nb.tum").write_text(tum.read_text())
     convert(tmp_path / "a\nb.tum", tmp_path / "a.kitti", reader="tum_poses")
     assert "note: a\\nb.tum: 1 line" in capsys.readouterr().out
+    told = CliRunner().invoke(app, ["inspect", str(tmp_path / "a\nb.tum"), "--reader", "tum_poses"]).output
+    assert "a\\nb.tum: 1 line" in told and "a\nb" not in told
 
 
 def test_the_ninth_column_of_rtabmap_is_read(tmp_path: Path) -> None:

@@ -40,6 +40,23 @@ def test_each_scan_of_an_e57_is_a_posed_frame(tmp_path: Path) -> None:
         assert cloud.colours[0].tolist() == [7, 7, 7]
 
 
+def test_far_tables_count_from_the_corner_of_the_las_files(tmp_path: Path) -> None:
+    write_las(tmp_path / "tile_0.las", FAR + ROOM)
+    np.savetxt(tmp_path / "tile_1.xyz", FAR + ROOM)
+    first, second = (frame.read_points() for frame in CloudFolderReader().open(tmp_path).frames)
+    np.testing.assert_allclose(first.points_in_cam, second.points_in_cam, atol=2e-4)
+
+
+@pytest.mark.parametrize("turned", [True, False])
+def test_far_scans_of_an_e57_count_from_whole_kilometres_unless_turned(tmp_path: Path, turned: bool) -> None:
+    poses = some_poses(1) if turned else np.eye(4)[None]
+    source = CloudFolderReader().open(write_e57(tmp_path / "hall.e57", poses, [FAR + ROOM]))
+    off = np.zeros(3) if turned else [431_000, 5_401_000, 0]
+    stored = (FAR + ROOM).astype(np.float32).astype(float)  # as pye57 writes them
+    np.testing.assert_allclose(source.frames[0].read_points().points_in_cam, stored - off, atol=1e-4)
+    assert any("counted from 431000 5401000 0" in note for note in source.notes) != turned
+
+
 @pytest.mark.parametrize("name", ["a.las", "a.e57"])
 @pytest.mark.parametrize("cut", [0, 3, 100, 0.5, 0.99])
 def test_files_that_are_cut_are_refused(tmp_path: Path, name: str, cut: float) -> None:
