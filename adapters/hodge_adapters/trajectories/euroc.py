@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters.posed import trajectory_of, written
 from hodge_adapters.text_rows import Row, first_text, listed, read_text, to_floats, write_text_atomically
-from hodge_adapters.trajectories.text import first_of_quaternion, ordered
+from hodge_adapters.trajectories.text import first_of_quaternion, ordered, refuse_other_columns
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
@@ -48,7 +48,9 @@ class EurocReader:
         bad = [line for line, pose in poses.items() if pose is None]
         if not good:
             raise SourceError(f"{path}: no line of `nanoseconds, x, y, z, qw, qx, qy, qz, …`: is it a EuRoC file?")
-        parsed = ordered(np.array(good), path)
+        table = np.array(good)
+        refuse_other_columns(table, path)
+        parsed = ordered(table)
         notes = ["poses are those of the body in the file (EuRoC's ground truth: the IMU), not of a camera"]
         notes += parsed.notes
         if bad:

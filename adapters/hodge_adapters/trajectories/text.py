@@ -77,7 +77,8 @@ def parse_tum(path: Path) -> ParsedTrajectory:
     w_first = has_w_first(path)
     if w_first:
         table[:, 4:] = np.roll(table[:, 4:], -1, axis=1)
-    parsed = ordered(table, path)
+    refuse_other_columns(table, path)
+    parsed = ordered(table)
     notes += [f"{path.name}: {note}" for note in parsed.notes]
     if w_first:
         notes.append(f"{path.name}: quaternions are read with w first, as its head names them")
@@ -178,17 +179,18 @@ def _tum_table(rows: Sequence[Row]) -> tuple[Floats, list[Row]]:
     return np.array(good, np.float64).reshape(-1, 8), bad
 
 
-def ordered(table: Floats, path: Path) -> ParsedTrajectory:
-    """The trajectory of rows (N, 8) `stamp tx ty tz qx qy qz qw`, ascending; of equal stamps the first is kept.
-
-    Raises `SourceError` where no quaternion is one: the file has other columns.
-    """
+def refuse_other_columns(table: Floats, path: Path) -> None:
+    """Raise `SourceError` where no row (N, 8) `stamp tx ty tz qx qy qz qw` ends in a quaternion."""
     lengths = np.linalg.norm(table[:, 4:], axis=1)
     if (np.abs(lengths - 1) > NO_QUATERNION).all():
         raise SourceError(
             f"{path}: no quaternion has a length near 1, the first {lengths[0]:.4g}: other columns, such as an index "
             "before the stamp, stand in its place: remove them"
         )
+
+
+def ordered(table: Floats) -> ParsedTrajectory:
+    """The trajectory of rows (N, 8) `stamp tx ty tz qx qy qz qw`, ascending; of equal stamps the first is kept."""
     stamps, first = np.unique(table[:, 0], return_index=True)
     notes = []
     if len(stamps) < len(table):
