@@ -6,6 +6,7 @@
     python -m benchmarks.wrong_loops clean               # graphs that nobody spoilt: how many edges are blamed
     python -m benchmarks.wrong_loops simulated --seed 1  # walks with 0 to 200 wrong loops, alone and in groups
     python -m benchmarks.wrong_loops short --seed 1      # walks of 15 to 95 steps with few loops, some steps wrong
+    python -m benchmarks.wrong_loops mistaken --seed 1   # walks with a loop a step, many of them mistaken in one way
     python -m benchmarks.wrong_loops lattices --seed 1   # cylinders and grids with 1 to 20 % of all edges wrong
 
 Errors are metres RMS of positions after a rigid fit: to the truth, or for graphs of the literature to their own
@@ -67,6 +68,7 @@ INJECTED = (
     ("parking-garage", 500),
 )
 GROUPS = (1, 10)
+MISTAKES = ("displaced", "turned round", "shortened", "inverted")
 NOISE = np.repeat([0.005, 0.02], 3)
 
 
@@ -231,6 +233,38 @@ def short_cases(seed: int) -> Iterator[Case]:
         yield replace(case, graph=replace(case.graph, i_from_j=motions), right=right)
 
 
+def mistaken_cases(seed: int) -> Iterator[Case]:
+    """Walks with as many loops as steps, a third to two thirds of which are mistaken in one way."""
+    kinds = itertools.product(("ring", "corridor", "streets"), MISTAKES, (1 / 3, 1 / 2, 2 / 3), (1.0, 10.0))
+    for number, (kind, mistake, share, wide) in enumerate(kinds):
+        rng = np.random.default_rng([seed, number])
+        poses = walk(kind, int(rng.integers(150, 400)), rng)
+        case = walked(f"{kind}, {share:.0%} {mistake}, sigmas × {wide:.0f}", poses, len(poses), 0, 1, True, rng)
+        loops = np.flatnonzero(~steps(case.graph))
+        rows = rng.choice(loops, round(share * len(loops)), replace=False)
+        motions, right, pairs = case.graph.i_from_j.copy(), case.right.copy(), case.graph.edges[rows]
+        motions[rows] = mistaken(mistake, motions[rows], poses[pairs[:, 0]], rng)
+        off = np.abs(se3.log(se3.inverse(motions[rows]) @ between(poses, pairs)))
+        right[rows] = (off < 16 * NOISE).all(axis=1)
+        graph = replace(case.graph, i_from_j=motions, information=case.graph.information / wide**2)
+        yield replace(case, graph=graph, right=right)
+
+
+def mistaken(mistake: str, motions: Floats, here: Floats, rng: np.random.Generator) -> Floats:
+    """Right motions (N, 4, 4) between poses, the first of them `here (N, 4, 4)`, mistaken in one of `MISTAKES`."""
+    if mistake == "displaced":
+        way = rng.normal(size=2)
+        shift = se3.from_parts(np.eye(3), np.append(4 * way / np.linalg.norm(way), 0.0))
+        return np.asarray(se3.inverse(here) @ shift @ here @ motions)
+    if mistake == "turned round":
+        return np.asarray(motions @ np.diag([-1.0, -1.0, 1.0, 1.0]))
+    if mistake == "inverted":
+        return np.asarray(se3.inverse(motions))
+    shorter = motions.copy()
+    shorter[:, :3, 3] *= 0.4
+    return shorter
+
+
 def walk(kind: str, count: int, rng: np.random.Generator) -> Floats:
     k = np.arange(count)
     if kind == "ring":
@@ -305,6 +339,7 @@ KINDS = {
     "clean": clean_cases,
     "simulated": simulated_cases,
     "short": short_cases,
+    "mistaken": mistaken_cases,
     "lattices": lattice_cases,
 }
 

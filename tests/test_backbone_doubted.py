@@ -35,6 +35,23 @@ def test_wrong_loops_over_few_steps_are_no_lattice(seed: int) -> None:
     assert made.error_m(found.world_from_cam) <= NEVER_WORSE * made.error_m(made.odometry())
 
 
+@pytest.mark.parametrize(("seed", "dimension"), [(0, 2), (0, 3)])
+def test_loops_half_of_which_are_displaced_alike_do_not_refute_a_right_odometry(seed: int, dimension: int) -> None:
+    """As where one corridor is taken for the next: steps were left out so that both halves could stand, 4 and 3 m."""
+    made = drive(seed=seed, dimension=dimension, count=200, world="town", loops=200, wrong=0.0)
+    rng, motion, right = np.random.default_rng(seed), made.graph.i_from_j.copy(), made.right.copy()
+    loops = np.flatnonzero(np.diff(made.graph.edges, axis=1)[:, 0] != 1)
+    wrong = rng.choice(loops, len(loops) // 2, replace=False)
+    away = rng.normal(size=2)
+    displaced = se3.from_parts(np.eye(3), np.append(5 * away / np.linalg.norm(away), 0.0))
+    here = made.truth[made.graph.edges[wrong, 0]]
+    motion[wrong] = se3.inverse(here) @ displaced @ here @ motion[wrong]
+    right[wrong] = False
+    made = replace(made, graph=replace(made.graph, i_from_j=motion), right=right)
+    found = diagnose(made.graph)
+    assert made.error_m(found.world_from_cam) < 0.5 * made.error_m(made.odometry())
+
+
 def test_groups_of_wrong_loops_at_one_place_are_as_many_testimonies() -> None:
     """As they contradict each other, they are no larger group than the right one: it was refused, 1.9 m."""
     made = round_trip(0, 6, dimension=2, wrong=1000, group=5)

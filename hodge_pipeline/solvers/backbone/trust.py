@@ -126,7 +126,8 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
     chain, found = inferred
     broken = (chain.bridged & (chain.step_edge >= 0)).sum() >= FEW_BREAKS
     doubted = trust == AUTO and many_loops
-    doubted = doubted and bool(broken or agreeing_loops(chain, ~found.used) > AGREEING * steps.sum())
+    agree = agreeing_loops(found.scales.applied(chain), ~found.used) if doubted else 0
+    doubted = doubted and bool(broken or agree > AGREEING * steps.sum())
     return _backbone(graph, chain, found, steps, doubted)
 
 
