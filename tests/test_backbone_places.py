@@ -73,27 +73,24 @@ def test_a_second_lap_over_the_first_says_more_than_one_mistaken_corridor(seed: 
     assert made.error_m(found.world_from_cam) < 1.0 < 30 < made.error_m(made.odometry())
 
 
-LATTICES = {"triangles": (1, 30, 31), "squares, wide": (1, 50)}
-
-
-@pytest.mark.parametrize(("spans", "share"), [("triangles", 0.1), ("squares, wide", 0.1)])
-def test_a_lattice_with_wrong_steps_is_judged_by_its_cycles(spans: str, share: float) -> None:
-    """A backbone kept up to half of its wrong edges, lost half of the right ones and was 4 to 16 m off."""
-    whole, truth = rings(200, LATTICES[spans][1])
-    graph = whole.select(np.flatnonzero(np.isin(np.diff(whole.edges, axis=1)[:, 0], LATTICES[spans])))
-    graph, wrong = spoiled(graph, share, 13)
+def test_a_lattice_with_wrong_steps_is_judged_by_its_cycles() -> None:
+    """Rings joined to the next without diagonals: a backbone kept up to half of the wrong edges, lost half of the right
+    ones and was 4 to 16 m off.
+    """
+    whole, truth = rings(200, 50)
+    graph = whole.select(np.flatnonzero(np.isin(np.diff(whole.edges, axis=1)[:, 0], (1, 50))))
+    graph, wrong = spoiled(graph, 0.1, 13)
     found = diagnose(graph)
     assert found.kept[wrong].sum() <= 1 + 0.2 * wrong.sum()  # some are the only edges of a vertex that may be right
     assert found.kept[~wrong].mean() > 0.99
     assert Drive(graph, truth, ~wrong).error_m(found.world_from_cam) < 0.5
 
 
-@pytest.mark.parametrize(("name", "seed"), [("short", 1), ("few", 2)])
-def test_loops_between_places_at_random_are_used_by_chance_nowhere(data_dir: Path, name: str, seed: int) -> None:
+def test_loops_between_places_at_random_are_used_by_chance_nowhere(data_dir: Path) -> None:
     """Of so many, some few lie near by chance, and agree with each other."""
-    graph = read_graph(data_dir / f"pose_graphs/slam_loops/robotcar/{name}/graph.g2o").graph
+    graph = read_graph(data_dir / "pose_graphs/slam_loops/robotcar/short/graph.g2o").graph
     assert graph is not None
-    rng, edges = np.random.default_rng(seed), graph.edges.copy()
+    rng, edges = np.random.default_rng(1), graph.edges.copy()
     loops = np.flatnonzero(np.abs(np.diff(edges, axis=1)[:, 0]) != 1)
     edges[loops] = np.sort([rng.choice(graph.vertex_count, 2, replace=False) for _ in loops], axis=1)
     backbone = find_backbone(replace(graph, edges=edges))

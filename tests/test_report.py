@@ -200,7 +200,7 @@ def test_the_terminal_gets_ten_lines_of_80_columns(report: Report) -> None:
         lines = brief(shown, "runs/a")
         assert len(lines) <= 10 and max(map(len, lines)) <= 80
         assert lines[0] == "verdict  Improved against odometry" and lines[1].startswith("  - ATE ")
-        assert "time     3.0 s, 4.0 CPU s, at most 300 MB" in lines
+        assert "time     3.0 s, 4.0 CPU s in the stages, at most 300 MB" in lines
         assert lines[-2:] == ["report   runs/a/report.html", "next     hodge view runs/a --web"]
     assert "  - … and 4 more measures: --verbose" in lines
     assert any(line.startswith("look     The viewing graph falls into 3 parts") for line in lines), "doubt comes first"

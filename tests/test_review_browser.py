@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 
 import hodge_pipeline
+from hodge_adapters.pose_graphs.g2o import write_g2o
+from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.pairs.edits import read_history
@@ -28,6 +30,7 @@ from hodge_pipeline.review.picking import nearest_point
 from hodge_pipeline.review.settle import error_m
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import true_poses
+from hodge_pipeline.types import ViewGraph
 from review_page import Page, start_browser, why_no_browser
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "docs"))
@@ -35,9 +38,11 @@ from make_which_edge import MISTAKEN, write_loops  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(why_no_browser()), reason=why_no_browser())]
 PLANTED = {f"{i}-{j}" for i, j in MISTAKEN}
+REACH, STEP_SIGMA = 3, 0.003
 SMALL = (
-    "outer_iterations=1", "edges={stage: sequential, reach: 3}", "evaluation.tables=false", "clouds.voxel_m=0.06",
-    "fusion=[{stage: cloud}]", "executor.workers=0", "recording.level=summary", "start.revisits=null", "solve_with=all",
+    "outer_iterations=1", f"edges={{stage: sequential, reach: {REACH}}}", "evaluation.tables=false",
+    "clouds.voxel_m=0.06", "fusion=[{stage: cloud}]", "executor.workers=0", "recording.level=off",
+    "start.revisits=null", "solve_with=all",
 )  # fmt: skip
 
 
@@ -46,9 +51,21 @@ def spoiled_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("review")
     source = make_sequence(folder / "demo", DemoOptions(width=160, height=120))
     write_loops(folder / "loops.g2o", source)
-    recipe = load_recipe("demo", [*SMALL, f"measured.files=[{{path: {folder / 'loops.g2o'}}}]"], source)
-    hodge_pipeline.run(recipe, folder / "run")
+    write_steps(folder / "steps.g2o", source)
+    measured = ", ".join(f"{{path: {folder / name}}}" for name in ("loops.g2o", "steps.g2o"))
+    hodge_pipeline.run(load_recipe("demo", [*SMALL, f"measured.files=[{measured}]"], source), folder / "run")
     return folder / "run"
+
+
+def write_steps(path: Path, source: Path) -> None:
+    """What registration of frames that follow each other would find, which takes most of a run's time."""
+    world_from_cam = true_poses(TumReader().open(source))
+    i, j = np.array([(i, i + k) for k in range(1, REACH + 1) for i in range(len(world_from_cam) - k)]).T
+    noise = se3.exp(np.random.default_rng(1).normal(0, STEP_SIGMA, (len(i), 6)))
+    i_from_j = se3.inverse(world_from_cam[i]) @ world_from_cam[j] @ noise
+    information = np.tile(np.eye(6) / STEP_SIGMA**2, (len(i), 1, 1))
+    numbers = np.arange(len(world_from_cam))
+    write_g2o(path, ViewGraph.from_edges(numbers, np.stack([i, j], axis=1), i_from_j, information))
 
 
 @pytest.fixture

@@ -272,9 +272,10 @@ def test_a_ring_in_the_plane_with_noise_out_of_it_is_confirmed():
     np.testing.assert_array_equal(np.flatnonzero(solution.weights == 0), np.arange(0, 240, 40))
 
 
-def test_edges_of_very_different_lengths_are_confirmed(data_dir: Path) -> None:
-    graph = open_source(data_dir / "pose_graphs/sesync/cubicle.g2o").graph
-    assert solve_robust(graph).confirmed is True
+def test_edges_of_very_different_lengths_are_kept_and_confirmed(data_dir: Path) -> None:
+    """At the optimum nearly all edges are far within what their information states."""
+    solution = solve_robust(open_source(data_dir / "pose_graphs/sesync/cubicle.g2o").graph)
+    assert solution.confirmed is True and (solution.weights == 0).mean() < 0.018
 
 
 def test_random_loops_in_a_large_lattice_are_left_out(data_dir: Path) -> None:

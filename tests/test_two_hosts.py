@@ -47,16 +47,25 @@ def on_two_hosts(script: str, folder: Path) -> str:
     return out
 
 
-def test_a_host_that_leaves_costs_a_retry(tmp_path: Path) -> None:
+def test_a_run_on_two_hosts_gives_the_same_bits_and_a_host_that_leaves_costs_a_retry(
+    short_sequence: Path,  # noqa: F811
+    tmp_path: Path,
+) -> None:
     told = on_two_hosts(
-        """
+        f"""
+        import hodge_pipeline
         from hodge_pipeline.executors.dask import cluster_workers, describe
+        from hodge_pipeline.recipe.schema import load_recipe
         from two_hosts import network
 
+        sets = ["start.whole_up_to=5", "recording.level=off", "fusion=[]"]
+        recipe = load_recipe("demo", [*sets, *{LIGHT!r}])
+        hodge_pipeline.run(recipe, "local", source={str(short_sequence)!r})
         with Hosts() as hosts:
+            hodge_pipeline.run(recipe, "cluster", source={str(short_sequence)!r}, dask=hosts.address)
             print(describe(hosts.address))
             with cluster_workers(hosts.address) as workers:
-                both = {seen for _, (_, seen) in workers.map(network, list(range(40)))}
+                both = {{seen for _, (_, seen) in workers.map(network, list(range(40)))}}
                 assert len(both) == 2, both
                 left = []
                 for row, (number, seen) in workers.map(network, list(range(60))):
@@ -65,27 +74,11 @@ def test_a_host_that_leaves_costs_a_retry(tmp_path: Path) -> None:
                     if len(left) == 5:
                         hosts.second_leaves()
                 assert sorted(left) == list(range(60))
-                after = {seen for _, (_, seen) in workers.map(network, list(range(10)))}
+                after = {{seen for _, (_, seen) in workers.map(network, list(range(10)))}}
                 assert len(after) == 1 and after < both
-        """,
-        tmp_path,
-    )
-    assert "2 workers with 2 threads on 2 hosts" in told and "GB; dashboard: http" in told
-
-
-def test_a_run_on_two_hosts_gives_the_same_bits(short_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
-    on_two_hosts(
-        f"""
-        import hodge_pipeline
-        from hodge_pipeline.recipe.schema import load_recipe
-
-        sets = ["start.whole_up_to=5", "recording.level=off", "fusion=[]"]
-        recipe = load_recipe("demo", [*sets, *{LIGHT!r}])
-        hodge_pipeline.run(recipe, "local", source={str(short_sequence)!r})
-        with Hosts() as hosts:
-            hodge_pipeline.run(recipe, "cluster", source={str(short_sequence)!r}, dask=hosts.address)
         """,
         tmp_path,
     )
     for name in ("poses.tum", "edges.csv", "graph.g2o"):
         assert (tmp_path / "cluster" / name).read_bytes() == (tmp_path / "local" / name).read_bytes()
+    assert "2 workers with 2 threads on 2 hosts" in told and "GB; dashboard: http" in told

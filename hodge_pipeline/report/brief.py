@@ -40,7 +40,8 @@ def all_notes(report: Report) -> list[str]:
 def _end(report: Report, folder: str) -> Iterator[str]:
     if report.stages:
         wall, cpu = (sum(getattr(stage, name) for stage in report.stages) for name in ("wall_s", "cpu_s"))
-        yield from labelled("time", f"{duration(wall)}, {cpu:.1f} CPU s{peak(report)}")
+        stages = " in the stages" if len(report.stages) > 1 else ""
+        yield from labelled("time", f"{duration(wall)}, {cpu:.1f} CPU s{stages}{peak(report)}")
     yield f"{'report':<{LABEL}}{folder}/report.html"
     command = next(line for line in next_commands(report, folder) if not line.startswith("#"))
     yield f"{'next':<{LABEL}}{command}"

@@ -157,9 +157,11 @@ def picture(scene: Points, view: View) -> Bytes:
     surface = np.flatnonzero(depth <= front[pixel] + deep)
     rows, pixel = rows[inside[surface]], pixel[surface]
     shades = _shades(scene.colours.take(rows, axis=0), facing[rows])
-    count = np.maximum(np.bincount(pixel, minlength=width * height), 1)
-    sums = [np.bincount(pixel, shades[:, channel], minlength=width * height) for channel in range(3)]
-    image = np.where(np.isfinite(front)[:, None], np.stack(sums, axis=1) / count[:, None], PAPER).astype(np.uint8)
+    covered = np.flatnonzero(np.isfinite(front))
+    count = np.bincount(pixel, minlength=width * height)[covered]
+    sums = [np.bincount(pixel, shades[:, channel], minlength=width * height)[covered] for channel in range(3)]
+    image = np.full((width * height, 3), PAPER, np.uint8)
+    image[covered] = np.stack(sums, axis=1) / count[:, None]
     return _filled(image.reshape(height, width, 3), front.reshape(height, width), view.fill_px)
 
 

@@ -12,7 +12,8 @@ _UNSEEN = "\x00-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ud800
 _ONE_LINE, _LINES = re.compile(f"[{_UNSEEN}]"), re.compile(f"(?![\n\t])[{_UNSEEN}]")
 _FORMULA = re.compile(r"['=+\-@\t\r]")
 _NO_STEM = re.compile(r"[^\w.+-]+")
-_NUMBER, _SYMBOL = re.compile(r"(?<![\d.])\d{19}(?!\d)"), re.compile(r"[A-Za-z](0|[1-9]\d{0,8})")
+_NUMBER = re.compile(r"[4-8][0-9]{18}(?<![\d.][0-9]{19})(?!\d)")  # looks back last: a page has a million characters
+_SYMBOL = re.compile(r"[A-Za-z](0|[1-9]\d{0,8})")
 SYMBOLS = 1 << 56
 """Of one letter."""
 UNKNOWN_UNIT = "units"
