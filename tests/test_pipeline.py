@@ -25,12 +25,12 @@ from hodge_pipeline.types.notes import Note
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 SMALL = (
-    "clouds.voxel_m=0.06", "fusion=[{stage: cloud}]", "executor.workers=1", "recording.level=summary",
+    "clouds.voxel_m=0.06", "fusion=[{stage: cloud}]", "executor.workers=0", "recording.level=summary",
     "edges.max_edges_per_frame=4", "evaluation.tables=false",
 )  # fmt: skip
 
 SHORT = (
-    "clouds.voxel_m=0.1", "executor.workers=0", "acceptance.min_fitness=0.05", "start.min_fitness=0.05",
+    "clouds.voxel_m=0.1", "acceptance.min_fitness=0.05", "start.min_fitness=0.05",
 )  # fmt: skip
 
 
@@ -213,7 +213,7 @@ def damaged_short(short: Run, tmp_path: Path) -> Path:
 
 
 def quick(source: Path, out: Path, *overrides: str) -> Run:
-    off = ("recording.level=off", "executor.workers=0", "outer_iterations=1")
+    off = ("recording.level=off", "outer_iterations=1")
     return hodge_pipeline.run(small_recipe(source, *off, *overrides), out)
 
 

@@ -242,14 +242,13 @@ def test_frames_that_clouds_place_move_with_their_key_frame_where_flow_goes_on(s
     assert not np.allclose(after[others], rigid[others], atol=1e-3), "their change is interpolated"
 
 
-@pytest.mark.parametrize("black", [range(25, 35), range(20, 30)])
-def test_black_frames_of_a_kinect_end_no_worse_than_odometry(data_dir: Path, tmp_path: Path, black: range) -> None:
+def test_black_frames_of_a_kinect_end_no_worse_than_odometry(data_dir: Path, tmp_path: Path) -> None:
     path = data_dir / "tum" / "rgbd_dataset_freiburg1_xyz_60"
     recipe = load_recipe(
         "tum", ["executor.workers=0", "recording.level=off", "evaluation.tables=false", "fusion=[]"], path
     )
     frames = list(TumReader().open(path).frames)
-    for row in black:
+    for row in range(25, 35):
         frames[row] = replace(frames[row], read_colour=partial(np.zeros, (480, 640, 3), np.uint8))
     source = replace(TumReader().open(path), frames=tuple(frames))
     rows = {row.name: row for row in hodge_pipeline.run(recipe, tmp_path / "run", source=source).report.trajectories}
