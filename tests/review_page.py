@@ -21,13 +21,6 @@ FLAGS = (
     "--webgl-antialiasing-mode=none",
 )  # fmt: skip
 
-DRAWN_SELDOM = """
-    const soon = window.requestAnimationFrame;
-    window.requestAnimationFrame = draw => setTimeout(() => soon(draw), 200);
-    window.cancelAnimationFrame = clearTimeout;
-"""
-"""Five pictures a second: drawn without a GPU, a scene takes all of a processor for as many as it can."""
-
 
 def why_no_browser() -> str:
     """Why no browser can be driven here; empty where one can."""
@@ -51,7 +44,6 @@ def start_browser(width: int = 1500, height: int = 1000, *flags: str) -> Any:
     for flag in (*FLAGS, *flags, f"--window-size={width},{height}"):
         options.add_argument(flag)
     browser = webdriver.Chrome(options=options, service=Service(str(shutil.which("chromedriver"))))
-    browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": DRAWN_SELDOM})
     browser.set_script_timeout(PATIENCE_S)
     return browser
 

@@ -157,13 +157,13 @@ def test_a_killed_registration_keeps_its_blocks(short: Run, tmp_path: Path) -> N
 
 
 def test_a_run_that_is_killed_again_and_again_ends_with_the_same_poses(short: Run, tmp_path: Path) -> None:
-    """Killed while its tenth step, from where it went on, gets its name: in turn just before and just after."""
+    """Killed while its eighth step, from where it went on, gets its name: in turn just before and just after."""
     script = textwrap.dedent(f"""
         import os, signal, sys
         import hodge_pipeline
         from hodge_pipeline.recipe.schema import load_recipe
         from hodge_pipeline.store import store
-        left, commit, after = [10], store._commit, sys.argv[1] == "after"
+        left, commit, after = [8], store._commit, sys.argv[1] == "after"
         def commit_and_die(part, path):
             left[0] -= 1
             if left[0] or after:
@@ -176,7 +176,7 @@ def test_a_run_that_is_killed_again_and_again_ends_with_the_same_poses(short: Ru
     """)
     ended = list[int]()
     while 0 not in ended:
-        assert len(ended) < 5, "every start goes on by nine steps at least"
+        assert len(ended) < 6, "every start goes on by seven steps at least"
         when = ("before", "after")[len(ended) % 2]
         done = subprocess.run([sys.executable, "-c", script, when], check=False, capture_output=True)
         ended.append(done.returncode)

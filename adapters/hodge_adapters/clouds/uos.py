@@ -51,7 +51,7 @@ def uos_pose(scan: Path) -> Floats | None:
     if path is None:
         return None
     values = to_floats([field for row in read_rows(path) for field in row.fields]) or []
-    if len(values) != 6 or not np.isfinite(values).all() or max(map(abs, values[3:])) > MOST_DEGREES:
+    if len(values) != 6 or not (np.abs(values) < se3.MAX_NUMBER).all() or max(map(abs, values[3:])) > MOST_DEGREES:
         raise SourceError(f"{path}: holds no six numbers (x y z in cm, angles in degrees): restore or remove it")
     turns = se3.so3_exp(np.diag(np.radians(values[3:])))
     turn = AHEAD_LEFT_UP @ turns[0] @ turns[1] @ turns[2] @ AHEAD_LEFT_UP.T

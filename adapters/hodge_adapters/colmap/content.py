@@ -115,7 +115,7 @@ def checked_content(reconstruction: pycolmap.Reconstruction, where: Path, tracks
     _check(content, where)
     for image in content.images:
         turn = reconstruction.images[image.image_id].cam_from_world().rotation.quat
-        if not abs(float(np.linalg.norm(turn)) - 1.0) < OFF_UNIT or not np.isfinite(image.world_from_cam).all():
+        if not abs(float(np.linalg.norm(turn)) - 1.0) < OFF_UNIT or not se3.is_motion(image.world_from_cam):
             raise SourceError(f"{where}: image {image.name!r}: its pose is not finite, or its quaternion is zero")
     return replace(content, notes=(f"{counted(len(lost), 'point')} not finite: left out",)) if lost else content
 

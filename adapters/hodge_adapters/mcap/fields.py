@@ -21,6 +21,7 @@ from mcap.records import Channel, Schema
 from hodge_adapters.mcap.protobuf import protobuf_decoder
 from hodge_adapters.mcap.records import Malformed, Place, read_place
 from hodge_adapters.mcap.ros_cdr import ros_decoder
+from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
 
@@ -168,7 +169,10 @@ def frame_id(message: Message) -> str:
 def pose_values(translation: Message, quaternion: Message) -> tuple[float, ...]:
     """(x, y, z, qx, qy, qz, qw); raises `Malformed` where they are no rigid motion."""
     values = [number(translation, axis) for axis in "xyz"] + [number(quaternion, axis) for axis in "xyzw"]
-    if not all(map(math.isfinite, values)) or not 0.25 < sum(value * value for value in values[3:]) < 4:
+    if (
+        not all(abs(value) < se3.MAX_NUMBER for value in values)
+        or not 0.25 < sum(value * value for value in values[3:]) < 4
+    ):
         raise Malformed("a pose that is no rigid motion")
     return tuple(values)
 

@@ -130,5 +130,5 @@ def _from_transforms(
 
 
 def _finite(trajectory: Trajectory) -> Trajectory:
-    good = np.isfinite(trajectory.world_from_cam).all(axis=(1, 2))
+    good = se3.is_motion(trajectory.world_from_cam)
     return Trajectory(trajectory.stamps_s[good], trajectory.world_from_cam[good])
