@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hodge_adapters.mcap.fields import pose_values
 from hodge_adapters.mcap.images import decode_rvl
 from hodge_adapters.mcap.protobuf import protobuf_decoder
 from hodge_adapters.mcap.reader import McapReader
@@ -263,3 +264,9 @@ def test_points_that_are_rounded_far_from_zero_are_told(tmp_path: Path, kind: st
         tmp_path / "out.mcap", replace(source, trajectory=Trajectory(np.array([100.0]), np.eye(4)[None]))
     )
     assert "1 point that is not finite left out" in written
+
+
+@pytest.mark.parametrize("x", [1e101, float("nan"), float("inf")])
+def test_a_pose_of_numbers_that_overflow_is_malformed(x: float) -> None:
+    with pytest.raises(Malformed, match="no rigid motion"):
+        pose_values({"x": x, "y": 0.0, "z": 0.0}, {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0})

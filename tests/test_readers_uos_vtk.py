@@ -100,7 +100,9 @@ def test_damaged_scans_are_named(tmp_path: Path, name: str, contents: bytes, mes
     assert name in str(error.value)
 
 
-@pytest.mark.parametrize("pose", ["1 2 3\n", "1 2 3\n4 5 nan\n", "one two three\n", "0 0 0 1e300 0 0"])
+@pytest.mark.parametrize(
+    "pose", ["1 2 3\n", "1 2 3\n4 5 nan\n", "one two three\n", "0 0 0 1e300 0 0", "1e101 0 0 0 0 0"]
+)
 def test_a_damaged_pose_is_named(tmp_path: Path, pose: str) -> None:
     with pytest.raises(SourceError, match="scan000.pose: holds no six numbers"):
         CloudFolderReader().open(uos(tmp_path, pose=pose))
