@@ -2,14 +2,13 @@
 
 import csv
 import json
+import os
 import shutil
 import signal
-import subprocess
-import sys
-import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,8 +19,11 @@ from hodge_adapters.trajectories.text import parse_tum
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError, WorkspaceError
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
+from hodge_pipeline.registration import register
 from hodge_pipeline.run_folder import Run
+from hodge_pipeline.store import store
 from hodge_pipeline.types.notes import Note
+from fresh_process import run_fresh
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 SMALL = (
@@ -135,57 +137,52 @@ def test_a_run_that_was_stopped_goes_on_where_it_stopped(short: Run, tmp_path: P
     np.testing.assert_array_equal(resumed.result.world_from_cam, short.result.world_from_cam)
 
 
+def killed_after_a_block(source: Path, out: Path) -> None:
+    keep = register.keep_block
+
+    def keep_and_die(*block: Any) -> None:
+        keep(*block)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    register.keep_block = keep_and_die
+    hodge_pipeline.run(short_recipe(source, "recording.level=off"), out)
+
+
 def test_a_killed_registration_keeps_its_blocks(short: Run, tmp_path: Path) -> None:
-    script = textwrap.dedent(f"""
-        import os, signal, sys
-        import hodge_pipeline
-        from hodge_pipeline.recipe.schema import load_recipe
-        from hodge_pipeline.registration import register
-        keep = register.keep_block
-        def write(folder, block, result):
-            keep(folder, block, result)
-            os.kill(os.getpid(), signal.SIGKILL)
-        register.keep_block = write
-        recipe = load_recipe("demo", {[*SMALL, *SHORT, "recording.level=off"]!r}, {str(short.source.path)!r})
-        hodge_pipeline.run(recipe, {str(tmp_path / "run")!r})
-    """)
-    killed = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True)
-    assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
+    killed = run_fresh(killed_after_a_block, short.source.path, tmp_path / "run")
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert len(list((tmp_path / "run/stages/register_edges-1.part/blocks").glob("*.npz"))) == 1
     resumed = hodge_pipeline.run(short_recipe(short.source.path, "recording.level=off"), tmp_path / "run")
     np.testing.assert_array_equal(resumed.result.world_from_cam, short.result.world_from_cam)
 
 
+def killed_at_a_step(source: Path, out: Path, when: str) -> None:
+    left, commit = [8], store._commit
+
+    def commit_and_die(part: Path, path: Path) -> None:
+        left[0] -= 1
+        if left[0] or when == "after":
+            commit(part, path)
+        if not left[0]:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    store._commit = commit_and_die
+    hodge_pipeline.run(short_recipe(source, "recording.level=off"), out)
+
+
 def test_a_run_that_is_killed_again_and_again_ends_with_the_same_poses(short: Run, tmp_path: Path) -> None:
     """Killed while its eighth step, from where it went on, gets its name: in turn just before and just after."""
-    script = textwrap.dedent(f"""
-        import os, signal, sys
-        import hodge_pipeline
-        from hodge_pipeline.recipe.schema import load_recipe
-        from hodge_pipeline.store import store
-        left, commit, after = [8], store._commit, sys.argv[1] == "after"
-        def commit_and_die(part, path):
-            left[0] -= 1
-            if left[0] or after:
-                commit(part, path)
-            if not left[0]:
-                os.kill(os.getpid(), signal.SIGKILL)
-        store._commit = commit_and_die
-        recipe = load_recipe("demo", {[*SMALL, *SHORT, "recording.level=off"]!r}, {str(short.source.path)!r})
-        hodge_pipeline.run(recipe, {str(tmp_path / "run")!r})
-    """)
-    ended = list[int]()
-    while 0 not in ended:
-        assert len(ended) < 6, "every start goes on by seven steps at least"
-        when = ("before", "after")[len(ended) % 2]
-        done = subprocess.run([sys.executable, "-c", script, when], check=False, capture_output=True)
-        ended.append(done.returncode)
-        assert ended[-1] in (0, -signal.SIGKILL), done.stderr.decode()
-    assert len(ended) > 2
-    found = Run.load(tmp_path / "run")
+    folder = tmp_path / "run"
+    for when, finished in (("before", 7), ("after", 15)):
+        killed = run_fresh(killed_at_a_step, short.source.path, folder, when)
+        assert killed.returncode == -signal.SIGKILL, killed.stderr
+        named = [path for path in folder.glob("stages/*/step.json") if path.parent.suffix != ".part"]
+        assert len(named) == finished, "every start goes on where the last one ended"
+    hodge_pipeline.run(short_recipe(short.source.path, "recording.level=off"), folder)
+    found = Run.load(folder)
     np.testing.assert_array_equal(found.poses, short.poses)
     np.testing.assert_array_equal(found.edges.i_from_j, short.edges.i_from_j)
-    assert not [path for path in (tmp_path / "run").rglob("*") if path.suffix in (".part", ".draft")]
+    assert not [path for path in folder.rglob("*") if path.suffix in (".part", ".draft")]
 
 
 def test_a_later_stage_alone_is_repeated_when_its_option_changes(short: Run, tmp_path: Path) -> None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import subprocess
 import sys
-import textwrap
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,15 +15,19 @@ from rerun.chunk import RrdReader
 
 import hodge_pipeline
 from hodge_pipeline import se3
+from hodge_pipeline.cli.main import main
 from hodge_pipeline.errors import HodgeError, SourceError, WorkspaceError
 from hodge_pipeline.recording import binary, layout, shapes
 from hodge_pipeline.registration.register import register_edges
+from hodge_pipeline.rounds.one_round import Work
 from hodge_pipeline.run_folder import Run
+from hodge_pipeline.scene import Round
 from hodge_pipeline.start.odometry import chain
 from hodge_pipeline.store import store as store_module
 from hodge_pipeline.store.store import stored
 from hodge_pipeline.types.ply import read_model
 from hodge_pipeline.uses.record_again import record_again
+from fresh_process import run_fresh
 from recording_data import rgb, rows
 from synthetic import short_sequence  # noqa: F401 - a fixture
 from test_pipeline import SHORT, SMALL, Log, short_recipe
@@ -79,31 +82,28 @@ def test_a_run_that_failed_leaves_a_recording_and_its_own_error(run: Run, tmp_pa
     assert layout.COLOUR in entities(tmp_path / "run/recording.rrd")
 
 
-def stopped(run: Run, out: Path, signal_name: str) -> subprocess.CompletedProcess[str]:
+def stopped(source: Path, out: Path, number: signal.Signals) -> None:
     """A run from the command line that gets a signal after its first solve."""
-    script = textwrap.dedent(f"""
-        import os, signal, sys
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background of a script ignores it
-        from hodge_pipeline.cli.main import main
-        from hodge_pipeline.rounds.one_round import Work
-        solve = Work.solve
-        def solve_and_stop(work, registered, *rest):
-            if registered.name == "round 2":
-                os.kill(os.getpid(), signal.{signal_name})
-            return solve(work, registered, *rest)
-        Work.solve = solve_and_stop
-        sys.argv[1:] = ["run", "demo", "--source", {str(run.source.path)!r}, "--out", {str(out)!r}, "--quiet"]
-        for change in {[*SMALL, *SHORT, *NORMAL]!r}:
-            sys.argv += ["--set", change]
-        main()
-    """)
-    return subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background of a script ignores it
+    solve = Work.solve
+
+    def solve_and_stop(work: Work, registered: Round, *rest: Any) -> Any:
+        if registered.name == "round 2":
+            os.kill(os.getpid(), number)
+        return solve(work, registered, *rest)
+
+    Work.solve = solve_and_stop  # type: ignore[method-assign]
+    sets = [word for change in (*SMALL, *SHORT, *NORMAL) for word in ("--set", change)]
+    sys.argv[1:] = ["run", "demo", "--source", str(source), "--out", str(out), "--quiet", *sets]
+    main()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
-@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
-def test_a_signal_ends_in_one_line_and_a_run_that_goes_on(run: Run, tmp_path: Path, name: str, code: int) -> None:
-    ended = stopped(run, tmp_path / "run", name)
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_in_one_line_and_a_run_that_goes_on(
+    run: Run, tmp_path: Path, number: signal.Signals, code: int
+) -> None:
+    ended = run_fresh(stopped, run.source.path, tmp_path / "run", number)
     assert ended.returncode == code
     assert ended.stderr.startswith("stopped: the same command goes on where it stopped; ")
     assert ended.stderr.count("\n") == 1
@@ -116,7 +116,7 @@ def test_a_signal_ends_in_one_line_and_a_run_that_goes_on(run: Run, tmp_path: Pa
 
 def test_a_killed_run_is_recorded_from_its_folder(run: Run, tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    assert stopped(run, folder, "SIGKILL").returncode == -signal.SIGKILL
+    assert run_fresh(stopped, run.source.path, folder, signal.SIGKILL).returncode == -signal.SIGKILL
     assert not (folder / "recording.rrd").exists()
     parts = [str(path) for path in sorted((folder / "stages").glob("record_*/*.rrd"))]
     mended = str(tmp_path / "mended.rrd")
