@@ -85,13 +85,13 @@ def test_a_lattice_whose_odometry_is_wrong_at_many_steps_needs_none() -> None:
 
 
 def test_a_fifth_of_the_edges_of_a_lattice_are_wrong() -> None:
-    """Rows walked to and fro, each joined to the next: growing alone ended 15 m off."""
-    rng, k = np.random.default_rng([0, 200, 20]), np.arange(200)
-    row, along = k // 20, k % 20
+    """Rows walked to and fro, each joined to the next: growing alone ended 5 m off."""
+    rng, k = np.random.default_rng([0, 200, 20]), np.arange(100)
+    row, along = k // 10, k % 10
     back = row % 2 == 1
-    place = np.stack([np.where(back, 19 - along, along), row, 0 * k], axis=1).astype(float)
+    place = np.stack([np.where(back, 9 - along, along), row, 0 * k], axis=1).astype(float)
     truth = se3.from_parts(se3.so3_exp(np.outer(np.where(back, np.pi, 0.0), [0.0, 0, 1])), place)
-    i, j = np.triu_indices(200, 1)
+    i, j = np.triu_indices(100, 1)
     edges = np.stack([i, j], axis=1)[np.linalg.norm(place[i] - place[j], axis=1) < 1.05]
     exact = se3.inverse(truth[edges[:, 0]]) @ truth[edges[:, 1]]
     motions = exact @ se3.exp(rng.normal(size=(len(edges), 6)) * np.repeat([0.01, 0.04], 3))
@@ -100,4 +100,4 @@ def test_a_fifth_of_the_edges_of_a_lattice_are_wrong() -> None:
     made = Drive(ViewGraph.from_edges(k, edges, motions), truth, ~wrong)
     found = diagnose(made.graph)
     assert made.error_m(found.world_from_cam) < 1.0
-    assert (found.kept & wrong).sum() <= 10
+    assert (found.kept & wrong).sum() <= 5

@@ -252,7 +252,7 @@ def test_a_reason_names_what_spoke_against_an_edge_whose_cycles_all_close() -> N
 
 def test_pieces_of_a_lattice_that_wrong_edges_cut_grow_again() -> None:
     rng = np.random.default_rng(0)
-    at = np.stack([*np.divmod(np.arange(24 * 24), 24), np.zeros(24 * 24)], axis=1)
+    at = np.stack([*np.divmod(np.arange(16 * 16), 16), np.zeros(16 * 16)], axis=1)
     poses = se3.from_parts(se3.so3_exp(rng.normal(size=at.shape)), at)
     pairs = np.argwhere(np.triu(np.linalg.norm(at[:, None] - at, axis=2) < 1.01, 1))
     pairs = pairs[rng.random(len(pairs)) < 0.75]

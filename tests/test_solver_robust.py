@@ -73,10 +73,10 @@ def rings(count: int, around: int) -> tuple[ViewGraph, np.ndarray]:
 
 def test_right_edges_of_a_drifting_graph_are_not_lost():
     """Noise bends the rings so far that edges which close them look wrong until the others hold the shape."""
-    graph, truth = rings(200, 40)
-    graph, wrong = spoiled(graph, 0.2, 13)
+    graph, truth = rings(120, 30)
+    graph, wrong = spoiled(graph, 0.2, 14)
     kept = solve_robust(graph, start=truth).weights > 0
-    assert kept[wrong].mean() < 0.025  # two are the only edges of a vertex that may be right
+    assert kept[wrong].mean() < 0.025  # one of 64
     assert kept[~wrong].mean() > 0.97
 
 
@@ -273,9 +273,13 @@ def test_a_ring_in_the_plane_with_noise_out_of_it_is_confirmed():
 
 
 def test_edges_of_very_different_lengths_are_kept_and_confirmed(data_dir: Path) -> None:
-    """At the optimum nearly all edges are far within what their information states."""
-    solution = solve_robust(open_source(data_dir / "pose_graphs/sesync/cubicle.g2o").graph)
-    assert solution.confirmed is True and (solution.weights == 0).mean() < 0.018
+    """At the optimum nearly all edges are far within what their information states: the first 2000 of 5750 poses."""
+    whole = open_source(data_dir / "pose_graphs/sesync/cubicle.g2o").graph
+    assert whole is not None
+    inside = np.flatnonzero((whole.edges < 2000).all(axis=1))
+    edges, motions, information = whole.edges[inside], whole.i_from_j[inside], whole.information[inside]
+    solution = solve_robust(ViewGraph.from_edges(whole.vertex_ids[:2000], edges, motions, information))
+    assert solution.confirmed is True and (solution.weights == 0).mean() < 0.004
 
 
 def test_random_loops_in_a_large_lattice_are_left_out(data_dir: Path) -> None:
