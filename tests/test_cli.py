@@ -1,7 +1,6 @@
 """The command line as a user types it."""
 
 import json
-import os
 import resource
 import subprocess
 import sys
@@ -10,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from command import hodge
+from fresh_process import run_fresh
 from hodge_pipeline.cli import entry
 from synthetic import LIGHT, short_sequence  # noqa: F401 - fixtures
 
@@ -155,16 +155,18 @@ def test_inspect_and_convert_take_a_reader_and_its_options(short_sequence: Path,
     assert made.returncode == 1 and "no poses to write" in made.stderr
 
 
+def on_a_full_disk(command: list[str]) -> None:
+    """The command where no file may be larger than 60 kB."""
+    sys.dont_write_bytecode = True
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
+    sys.argv[1:] = command
+    entry.main()
+
+
 def test_a_full_disk_is_one_line_and_keeps_what_was_finished(short_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
-    command = [sys.executable, "-m", "hodge_pipeline.cli.main", "run", "tum", "--source", str(short_sequence)]
-    command += ["--out", str(tmp_path / "run"), *SETS, "--quiet"]
-
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
-
-    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, check=False, preexec_fn=limit, env=environment)  # noqa: PLW1509
+    command = ["run", "tum", "--source", str(short_sequence), "--out", str(tmp_path / "run"), *SETS, "--quiet"]
+    done = run_fresh(on_a_full_disk, command)
     assert done.returncode == 1, done.stderr
     assert "make room" in done.stderr
-    again = hodge(*command[3:])
+    again = hodge(*command)
     assert again.returncode == 0, again.stderr

@@ -236,7 +236,9 @@ def test_unreadable_and_empty_frames_are_kept_without_edges_and_reported(damaged
 def test_a_sequence_in_two_pieces_is_a_warning_that_lists_them(damaged_short: Path, tmp_path: Path) -> None:
     for number, path in enumerate(sorted((damaged_short / "depth").iterdir())):
         if number >= 4:
-            cv2.imwrite(str(path), np.random.default_rng(number).integers(4000, 20000, (60, 80), np.uint16))
+            depth = np.random.default_rng(number).integers(4000, 20000, (60, 80), np.uint16)
+            depth[:, 16:] = 0
+            cv2.imwrite(str(path), depth)
     result = quick(damaged_short, tmp_path / "run", *SHORT)
     assert result.result.solution is not None
     assert result.result.solution.component.max() >= 1

@@ -123,11 +123,11 @@ def test_poses_are_of_all_frames_wherever_they_come_from(run: Run, sequence: Pat
     drift = se3.exp(np.linspace(0, 1, FRAMES)[:, None] * np.array([0, 0.05, 0, 0.05, 0, 0]))
     write_tum(tmp_path / "slam.txt", Trajectory(np.array([frame.stamp_s for frame in frames]), true @ drift))
     given = load_recipe("slam_refine", [*quick, f"start.path={tmp_path / 'slam.txt'}", "start.every=3"], sequence)
-    unordered = load_recipe("demo", [*quick, "start=unordered"], sequence)
-    for name, recipe in (("given", given), ("unordered", unordered)):
+    unordered = load_recipe("demo", [*quick, "start=unordered", "source.reader.every=3"], sequence)
+    for name, recipe, count in (("given", given, FRAMES), ("unordered", unordered, FRAMES // 3)):
         made = hodge_pipeline.run(recipe, tmp_path / name)
         for one in (made, Run.load(made.folder)):
-            assert one.poses.shape == (FRAMES, 4, 4) and len(one.source.frames) == FRAMES
+            assert one.poses.shape == (count, 4, 4) and len(one.source.frames) == count
             np.testing.assert_array_equal(one.poses, made.poses)
         assert made.key_frames.are_all == (name == "unordered")
         np.testing.assert_allclose(parse_tum(poses_of(made)).trajectory.world_from_cam, made.poses, atol=1e-9)

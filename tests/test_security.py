@@ -192,7 +192,8 @@ def test_a_run_goes_on_with_or_without_the_cluster(run_folder: Path, made: Run) 
     again = load_recipe(str(run_folder / "recipe.yaml"))
     for stage in ("register_edges-1", "solve_edges-1"):
         shutil.rmtree(run_folder / "stages" / stage)
-    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+    one = {"processes": False, "protocol": "tcp", "n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
+    with LocalCluster(**one) as cluster:
         found = hodge_pipeline.run(again, run_folder, dask=cluster.scheduler_address)
         assert (found.result.world_from_cam == made.result.world_from_cam).all()
         solve_again(run_folder, dask=cluster.scheduler_address)
