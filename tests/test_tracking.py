@@ -39,10 +39,11 @@ from hodge_pipeline.start.key_frames import KeyFrameStart, Tracked, followers
 from hodge_pipeline.start.odometry import OdometryStart
 from hodge_pipeline.start.unordered.join import _stays
 from hodge_pipeline.start.unordered.start import Start
-from hodge_pipeline.store.store import Store
+from hodge_pipeline.store.store import Store, stored
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Source, ViewGraph
 from hodge_pipeline.types.notes import Note
 from hodge_pipeline.uses.recipe_run import solve_again
+from test_pipeline import Log
 
 FRAMES, BLOCK, FUSED = 64, 48, "fusion=[cloud]"
 SMALL = (
@@ -355,16 +356,20 @@ def test_a_killed_tracking_keeps_its_blocks(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(TrackedBlocks, "write", write)
+    folder, after = tmp_path / "run", Log(stop_at="registration, round 1")
     with pytest.raises(KeyboardInterrupt):
-        hodge_pipeline.run(small_recipe(sequence), tmp_path / "run")
+        hodge_pipeline.run(small_recipe(sequence), folder)
     if earlier:
-        (block,) = (tmp_path / "run").rglob("blocks/000000.npz")
-        with np.load(block) as stored:
-            np.savez(block, **{name: stored[name] for name in stored.files if name != "apart"})
-    again = hodge_pipeline.run(small_recipe(sequence), tmp_path / "run")
-    assert written == ([0, 0, 1] if earlier else [0, 1])
-    np.testing.assert_array_equal(again.result.world_from_cam, run.result.world_from_cam)
-    assert not (again.folder / "stages" / "track-1" / "blocks").exists()
+        (block,) = folder.rglob("blocks/000000.npz")
+        with np.load(block) as columns:
+            np.savez(block, **{name: columns[name] for name in columns.files if name != "apart"})
+    with pytest.raises(KeyboardInterrupt):
+        hodge_pipeline.run(small_recipe(sequence), folder, watcher=after)
+    assert written == ([0, 0, 1] if earlier else [0, 1]) and after.stages[-1] == after.stop_at
+    assert not (folder / "stages/track-1/blocks").exists()
+    (found,), (expected,) = (stored(path / "stages", tracked.track) for path in (folder, run.folder))
+    np.testing.assert_array_equal(found.world_from_key, expected.world_from_key)
+    np.testing.assert_array_equal(found.clouds.points, expected.clouds.points)
 
 
 def test_clouds_are_joined_without_the_border_twice(sequence: Path, whole: Tracked) -> None:
