@@ -86,14 +86,17 @@ def tracking_options(recipe: Recipe) -> TrackingOptions:
     return recipe.start._tracking(recipe.clouds)
 
 
-def track(source: Source, folder: Path) -> tuple[Tracked, list[str]]:
+def track(source: Source, folder: Path, readout: Readout | None = None) -> tuple[Tracked, list[str]]:
+    """The sequence tracked, and the notes; its read-out, which is a third of the cost to estimate, is given."""
     folder.mkdir()
     options, notes = tracking_options(small_recipe(source.path)), list[str]()
 
     def tell(*told: Note) -> None:
         notes.extend(map(str, told))
 
-    return tracked.track(source, options, workers=InProcess(), step=Step(folder, no_progress, tell)), notes
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tracked, "estimate_readout", lambda *_: readout)
+        return tracked.track(source, options, workers=InProcess(), step=Step(folder, no_progress, tell)), notes
 
 
 def all_poses(source: Source, found: Tracked, world_from_key: Floats) -> Floats:
@@ -415,12 +418,9 @@ def test_a_clock_that_goes_back_is_said_and_costs_no_frame(sequence: Path, whole
     assert np.abs(poses - expected).max() < 0.06
 
 
-def test_an_estimated_read_out_is_told_and_used_by_the_frames(
-    sequence: Path, whole: Tracked, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_estimated_read_out_is_told_and_used_by_the_frames(sequence: Path, whole: Tracked, tmp_path: Path) -> None:
     source, none = TumReader().open(sequence), whole
-    monkeypatch.setattr(tracked, "estimate_readout", lambda *_: Readout(0.022, 0.02, 0.0239))
-    found, notes = track(source, tmp_path / "found")
+    found, notes = track(source, tmp_path / "found", Readout(0.022, 0.02, 0.0239))
     assert none.readout_s == 0.0 and followers(source, found).readout_s == 0.022
     assert any("estimated: 22 ms (20 to 24)" in note for note in notes)
     step, poses = Step(tmp_path, no_progress, lambda *_: None), all_poses(source, none, none.world_from_key)
