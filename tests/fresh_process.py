@@ -1,6 +1,6 @@
-"""A function in a process of its own, which may be killed: forked from one that has imported everything and run nothing.
+"""A function in a process of its own, which may be killed: a fork of one that has imported everything and run nothing.
 
-A start of Python with all libraries costs 4 s of CPU; a fork of this process would hang where it holds threads.
+A start of Python with all libraries costs 4 s of CPU; a fork of the process of the tests would hang where it has threads.
 """
 
 from __future__ import annotations

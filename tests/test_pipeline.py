@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import hodge_pipeline
+from fresh_process import run_fresh
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.errors import HodgeError, RecipeError, SourceError, WorkspaceError
@@ -23,7 +24,6 @@ from hodge_pipeline.registration import register
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.store import store
 from hodge_pipeline.types.notes import Note
-from fresh_process import run_fresh
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 SMALL = (

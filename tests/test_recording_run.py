@@ -14,6 +14,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 import hodge_pipeline
+from fresh_process import run_fresh
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import main
 from hodge_pipeline.errors import HodgeError, SourceError, WorkspaceError
@@ -27,7 +28,6 @@ from hodge_pipeline.store import store as store_module
 from hodge_pipeline.store.store import stored
 from hodge_pipeline.types.ply import read_model
 from hodge_pipeline.uses.record_again import record_again
-from fresh_process import run_fresh
 from recording_data import rgb, rows
 from synthetic import short_sequence  # noqa: F401 - a fixture
 from test_pipeline import SHORT, SMALL, Log, short_recipe

@@ -164,7 +164,7 @@ def test_six_real_fragments_in_no_order(data_dir: Path, tmp_path: Path) -> None:
 def test_the_recipe_scans_from_files_to_a_report(tmp_path: Path) -> None:
     folder = tmp_path / "scans"
     folder.mkdir()
-    for name, (k, pose) in zip(("b", "a", "c"), enumerate(POSES), strict=True):
+    for name, (k, pose) in zip(("b", "a"), enumerate(POSES[:2]), strict=True):
         write_ply(folder / f"{name}.ply", read(seen_from(pose, furnished_corner(k, 10_000))))
     plain = [
         "recording.level=off",
