@@ -1,6 +1,6 @@
 """A function in a process of its own, which may be killed: a fork of one that has imported everything and run nothing.
 
-A start of Python with all libraries costs 4 s of CPU; a fork of the process of the tests would hang where it has threads.
+A start of Python with all libraries costs 4 s of CPU; a fork of the process of the tests would hang for its threads.
 """
 
 from __future__ import annotations
