@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -39,13 +40,18 @@ HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 """What moves the one desk onto the other: the room's middle is the origin, z is up."""
 
 
-def write_loops(path: Path, source: Path) -> None:
-    """Loop closures as a place recogniser gives them, with noise; it took one desk for the other three times."""
+def write_loops(
+    path: Path,
+    source: Path,
+    right: Sequence[tuple[int, int]] = RIGHT,
+    mistaken: Sequence[tuple[int, int]] = MISTAKEN,
+) -> None:
+    """Loop closures as a place recogniser gives them, with noise, of one desk taken for the other in `mistaken`."""
     frames = TumReader().open(source)
     world_from_cam = true_poses(frames)
-    pairs = np.array([*RIGHT, *MISTAKEN])
+    pairs = np.array([*right, *mistaken])
     moved = world_from_cam[pairs[:, 1]]
-    moved[len(RIGHT) :] = HALF_TURN @ moved[len(RIGHT) :]
+    moved[len(right) :] = HALF_TURN @ moved[len(right) :]
     noise = se3.exp(np.array([0.004] * 3 + [0.005] * 3) * np.random.default_rng(0).normal(size=(len(pairs), 6)))
     measured = se3.inverse(world_from_cam[pairs[:, 0]]) @ moved @ noise
     information = np.tile(np.eye(6) / 0.003**2, (len(pairs), 1, 1))

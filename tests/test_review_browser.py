@@ -34,11 +34,13 @@ from hodge_pipeline.types import ViewGraph
 from review_page import Page, start_browser, why_no_browser
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "docs"))
-from make_which_edge import MISTAKEN, write_loops  # noqa: E402
+from make_which_edge import write_loops  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(why_no_browser()), reason=why_no_browser())]
+FRAMES, REACH, STEP_SIGMA = 60, 2, 0.003
+RIGHT, MISTAKEN = ((1, 54), (3, 56), (5, 58)), ((4, 31), (5, 32), (6, 33))
+"""As in docs/which-edge.md, of half as many frames."""
 PLANTED = {f"{i}-{j}" for i, j in MISTAKEN}
-REACH, STEP_SIGMA = 3, 0.003
 SMALL = (
     "outer_iterations=1", f"edges={{stage: sequential, reach: {REACH}}}", "evaluation.tables=false",
     "clouds.voxel_m=0.06", "fusion=[{stage: cloud}]", "executor.workers=0", "recording.level=off",
@@ -49,8 +51,8 @@ SMALL = (
 @pytest.fixture(scope="module")
 def spoiled_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("review")
-    source = make_sequence(folder / "demo", DemoOptions(width=160, height=120))
-    write_loops(folder / "loops.g2o", source)
+    source = make_sequence(folder / "demo", DemoOptions(frames=FRAMES, turns=1.12, width=160, height=120))
+    write_loops(folder / "loops.g2o", source, RIGHT, MISTAKEN)
     write_steps(folder / "steps.g2o", source)
     measured = ", ".join(f"{{path: {folder / name}}}" for name in ("loops.g2o", "steps.g2o"))
     hodge_pipeline.run(load_recipe("demo", [*SMALL, f"measured.files=[{measured}]"], source), folder / "run")
@@ -160,7 +162,7 @@ def test_a_line_clicked_in_the_scene_is_selected(browser: Any, review: Review) -
 
 def test_an_edge_added_by_three_clicked_points(browser: Any, review: Review, run_folder: Path) -> None:
     page, session = Page(browser, review), review.session
-    i, j = 4, 8
+    i, j = 4, 7
     truth = true_poses(session.subject.source)
     motion = se3.inverse(truth[i]) @ truth[j]
     clouds = session.subject.clouds
@@ -197,7 +199,7 @@ def test_a_first_guess_by_the_handles_of_the_second_cloud(browser: Any, review: 
     page, session = Page(browser, review), review.session
     page.browser.execute_script("document.getElementById('adding').open = true")
     page.find("#first").send_keys("4")
-    page.find("#second").send_keys("8")
+    page.find("#second").send_keys("7")
     page.click("#pick")
     page.until(lambda: page.find("#candidate").is_displayed())
     before = session.candidate.guess  # type: ignore[union-attr]

@@ -296,19 +296,22 @@ def test_costs_are_those_of_the_run_that_computed_it_and_are_added_by_title(tmp_
     assert cost["peak_mb"] == max(part["peak_mb"] for part in parts) > 1
 
 
-def test_shared_pages_are_counted_again_only_when_memory_has_grown(monkeypatch: pytest.MonkeyPatch) -> None:
-    looks = list[int]()
-    one = SimpleNamespace(rss=100_000_000)
+def test_shared_pages_of_workers_are_counted_again_only_when_memory_has_grown(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks, workers = list[int](), [cost_module.psutil.Process()]
+    one = SimpleNamespace(rss=50_000_000)
     monkeypatch.setattr(cost_module.psutil.Process, "memory_info", lambda process: one)
-    monkeypatch.setattr(cost_module.psutil.Process, "children", lambda process, recursive: [])
+    monkeypatch.setattr(cost_module.psutil.Process, "children", lambda process, recursive: workers)
     monkeypatch.setattr(cost_module, "_memory_bytes", lambda process: looks.append(one.rss) or one.rss // 2)
     monitor, peaks = cost_module.Monitor(), []
-    for one.rss in (100_000_000, 101_000_000, 200_000_000, 80_000_000):
+    for one.rss in (50_000_000, 50_500_000, 100_000_000, 40_000_000):
         with monitor.measure() as spent:
             pass
         peaks.append(spent.peak_mb)
-    assert looks == [100_000_000, 200_000_000]
-    assert peaks == [50.0, 50.5, 100.0, 40.0]
+    assert looks == [50_000_000] * 2 + [100_000_000] * 2  # of each process
+    workers.clear()
+    with monitor.measure() as spent:
+        pass
+    assert [*peaks, spent.peak_mb] == [50.0, 50.5, 100.0, 40.0, 40.0] and len(looks) == 4
 
 
 VALUES: list[tuple[Any, Any]] = [

@@ -13,6 +13,8 @@ import pytest
 from synthetic import LIGHT, short_sequence  # noqa: F401
 
 PATIENCE_S = 300
+SILENCE = "12s"
+"""After which a host that says nothing has left; half a minute where nothing is set."""
 HOSTS = Path(__file__).with_name("two_hosts.py")
 
 
@@ -34,6 +36,7 @@ def on_two_hosts(script: str, folder: Path) -> str:
     file.write_text("from two_hosts import Hosts\n" + textwrap.dedent(script))
     paths = os.pathsep.join([str(HOSTS.parent), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": paths, "DASK_TEMPORARY_DIRECTORY": str(folder)}
+    environment["DASK_DISTRIBUTED__COMM__TIMEOUTS__TCP"] = SILENCE
     child = subprocess.Popen(
         ["unshare", "-Urn", "--kill-child", sys.executable, str(file)], cwd=folder, env=environment,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,

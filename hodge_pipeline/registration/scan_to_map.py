@@ -183,7 +183,7 @@ class _Map:
             rows, _ = small_gicp.KdTree(sweep).batch_knn_search(sampled, NEIGHBOURS)
             around = sampled[np.asarray(rows, np.int64)]
             around -= around.mean(axis=1, keepdims=True)
-            variances = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", around, around))
+            variances = np.linalg.eigvalsh(np.swapaxes(around, 1, 2) @ around)
             is_flat = variances[:, 1] > FLATTEST * variances[:, 2]
             if is_flat.sum() > NEIGHBOURS:
                 sweep = small_gicp.PointCloud(sampled[is_flat])

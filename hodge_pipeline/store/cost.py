@@ -33,9 +33,9 @@ class Cost:
 class Monitor:
     """Measures the process tree: workers that come and go are counted while they live.
 
-    Memory is the proportional share (PSS) where the system tells it, so that pages mapped by several workers count
-    once; elsewhere the resident size. Its part of the resident size is measured whenever that has grown, and else taken
-    to be what it was.
+    Memory of several is the proportional share (PSS) where the system tells it, so that pages mapped by all count once;
+    elsewhere, and of one alone, the resident size. The share's part of that is measured whenever it has grown, and else
+    taken to be what it was.
     """
 
     _cpu_by_process: dict[tuple[int, float], float] = field(default_factory=dict)
@@ -81,9 +81,12 @@ class Monitor:
                 alive.append(process)
             except psutil.Error:  # it ended meanwhile: its last sample stands
                 continue
-        if resident > GROWTH * self._largest:
-            self._largest, self._part = resident, sum(map(_memory_bytes, alive)) / resident
-        cost.peak_mb = max(cost.peak_mb, self._part * resident / 1e6)
+        part = 1.0
+        if len(alive) > 1:
+            if resident > GROWTH * self._largest:
+                self._largest, self._part = resident, sum(map(_memory_bytes, alive)) / resident
+            part = self._part
+        cost.peak_mb = max(cost.peak_mb, part * resident / 1e6)
 
 
 def _memory_bytes(process: psutil.Process) -> int:
