@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sqlite3
 import subprocess
@@ -250,6 +251,17 @@ def test_damaged_binary_models_name_file_and_byte(tmp_path: Path, name: str, edi
     with pytest.raises(SourceError, match=message) as error:
         ColmapReader().open(tmp_path / "binary")
     assert path.name in str(error.value) and "at byte" in str(error.value)
+
+
+@pytest.mark.parametrize("x", ["1e101", "nan"])
+def test_a_pose_that_is_none_is_refused_by_its_image(tmp_path: Path, x: str) -> None:
+    synthetic(tmp_path)
+    path = tmp_path / "text" / "frames.txt"
+    *head, frame = path.read_text("utf-8").splitlines()
+    frame = re.sub(r"^((?:\S+ ){6})\S+", rf"\g<1>{x}", frame)
+    path.write_text("\n".join([*head, frame]) + "\n", "utf-8")
+    with pytest.raises(SourceError, match=r"frames.txt:|camera00000\d_frame00000\d.png"):
+        ColmapReader().open(tmp_path / "text")
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])

@@ -116,7 +116,9 @@ def checked_content(reconstruction: pycolmap.Reconstruction, where: Path, tracks
     for image in content.images:
         turn = reconstruction.images[image.image_id].cam_from_world().rotation.quat
         if not abs(float(np.linalg.norm(turn)) - 1.0) < OFF_UNIT or not se3.is_motion(image.world_from_cam):
-            raise SourceError(f"{where}: image {image.name!r}: its pose is not finite, or its quaternion is zero")
+            raise SourceError(
+                f"{where}: image {image.name!r}: its quaternion is zero, or a number is none or past {se3.MAX_NUMBER:g}"
+            )
     return replace(content, notes=(f"{counted(len(lost), 'point')} not finite: left out",)) if lost else content
 
 
