@@ -71,7 +71,7 @@ class Placements:
         """The layers (3, P) of the solution, of pairs in one piece."""
         first, second = self.pairs.T
         together = (self.found.piece[first] == self.found.piece[second]) & (first != second)
-        return np.asarray(self.layers(np.eye(4)) * together)
+        return np.asarray(self.layers(np.eye(4)[None])[0] * together)
 
     @cached_property
     def usual(self) -> float:
@@ -89,37 +89,49 @@ class Placements:
         return np.concatenate([second, np.swapaxes(second, 1, 2)]).reshape(-1, 9)
 
     def layers(self, motion: Floats) -> Floats:
-        """For each pair (3, P), its second view moved by (4, 4): whether an edge agrees (from 1 down to 0), the
-        probability that one would, and the log-evidence of their order.
+        """For each motion (K, 4, 4) and pair (K, 3, P), its second view moved: whether an edge agrees (from 1 down to
+        0), the probability that one would, and the log-evidence of their order.
         """
-        agreeing = self._agreeing(motion)
+        poses = self.found.poses
+        moved = motion[:, None] @ poses
+        agreeing = self._agreeing(motion, moved)
         expected, order = np.zeros_like(agreeing), np.zeros_like(agreeing)
         if self.model is not None:
-            expected = self.model.joining.between(self.found.poses, motion @ self.found.poses).ravel()
+            each = self.model.joining.between(poses, moved.reshape(-1, 4, 4))
+            expected = each.reshape(len(poses), *moved.shape[:2]).swapaxes(0, 1).reshape(agreeing.shape)
         if self.usual:
-            edges, sure = self.evidence.graph.edges, np.zeros_like(agreeing)
-            rows = np.flatnonzero(np.abs(edges[:, 1] - edges[:, 0]) == 1)
-            for pair in (self.row[: len(edges)], self.row[len(edges) :]):
-                np.maximum.at(sure, pair[rows], consecutive_log_evidence(self.evidence)[rows])
             next_to = np.abs(self.pairs[:, 1] - self.pairs[:, 0]) == 1
-            order = sure * agreeing
-            order[next_to] += np.log(JUMP + (1 - JUMP) * expected[next_to] / self.usual)
-        return np.stack([agreeing, expected, order])
+            order = self.sure * agreeing
+            order[:, next_to] += np.log(JUMP + (1 - JUMP) * expected[:, next_to] / self.usual)
+        return np.stack([agreeing, expected, order], axis=1)
 
-    def _agreeing(self, motion: Floats) -> Floats:
-        """From 1 down to 0 (P,) how well the edge of each pair agrees, the first view still, the second moved."""
-        edges, measured, noise = self.evidence.graph.edges, self.evidence.graph.i_from_j, self.evidence.noise
+    @cached_property
+    def sure(self) -> Floats:
+        """The log-evidence (P,) of the edge that joins consecutive views; 0 of other pairs."""
+        edges, out = self.evidence.graph.edges, np.zeros(len(self.pairs))
+        rows = np.flatnonzero(np.abs(edges[:, 1] - edges[:, 0]) == 1)
+        for pair in (self.row[: len(edges)], self.row[len(edges) :]):
+            np.maximum.at(out, pair[rows], consecutive_log_evidence(self.evidence)[rows])
+        return out
+
+    def _agreeing(self, motion: Floats, moved: Floats) -> Floats:
+        """From 1 down to 0 (K, P) how well the edge of each pair agrees, the first view still, the second `moved
+        (K, V, 4, 4)`.
+        """
+        edges, poses, noise = self.evidence.graph.edges, self.found.poses, self.evidence.noise
         widest = np.minimum(np.sqrt(UNSETTLED) * noise.rotation_rad, np.pi)
-        alike = self.proposed @ motion[:3, :3].ravel() > np.tile(1 + 2 * np.cos(widest), 2) - ROUNDING
-        second, first = (np.flatnonzero(half) for half in np.split(alike, 2))
-        row, moved = np.concatenate([second, first]), motion @ self.found.poses
-        tails = np.concatenate([self.found.poses[edges[second, 0]], moved[edges[first, 0]]])
-        heads = np.concatenate([moved[edges[second, 1]], self.found.poses[edges[first, 1]]])
-        left = se3.log(se3.inverse(measured[row]) @ se3.inverse(tails) @ heads)
-        turned, shifted = squares_at_both_ends(measured[row], left)
+        turned_alike = motion[:, :3, :3].reshape(-1, 9) @ self.proposed.T
+        trial, directed = np.nonzero(turned_alike > np.tile(1 + 2 * np.cos(widest), 2) - ROUNDING)
+        is_first, row = np.divmod(directed, len(edges))
+        still, going = np.where(is_first, edges[row].T[::-1], edges[row].T)
+        tails, heads = poses[still], moved[trial, going]
+        tails, heads = (np.where(is_first[:, None, None], *both) for both in ((heads, tails), (tails, heads)))
+        measured = self.evidence.graph.i_from_j[row]
+        left = se3.log(se3.inverse(measured) @ se3.inverse(tails) @ heads)
+        turned, shifted = squares_at_both_ends(measured, left)
         chi2 = turned / noise.rotation_rad[row] ** 2 + shifted / noise.translation_m[row] ** 2
-        out = np.zeros(len(self.pairs))
-        np.maximum.at(out, self.row[np.flatnonzero(alike)], np.sqrt(np.maximum(0.0, 1 - chi2 / UNSETTLED)))
+        out = np.zeros((len(motion), len(self.pairs)))
+        np.maximum.at(out, (trial, self.row[directed]), np.sqrt(np.maximum(0.0, 1 - chi2 / UNSETTLED)))
         return out
 
     @cached_property

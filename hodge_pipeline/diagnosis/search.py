@@ -9,6 +9,7 @@ log-evidence of the cut rises by it, the side of the cut moves.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -25,8 +26,10 @@ from hodge_pipeline.types import Bools, Floats, Ints
 LARGEST = 150
 """Views: with more, all pairs of them would cost too much."""
 ROUNDS = 10
-TRIED = 200
-"""Motions in each round."""
+TRIED, TOGETHER = 200, 50_000
+"""Motions in each round; and pairs of views, of all motions that are weighed at once, up to which calls cost more than
+what they do.
+"""
 MOST_PROPOSALS = 1000
 """Edges that propose one, those likeliest by the order of the views."""
 LEAST_GAIN, LEAST_OF_FEW = 2.0, 0.7
@@ -91,10 +94,11 @@ def _moves(here: Placements) -> list[Move]:
     urgent += np.where(in_order, sure, 0.0)[proposals.edge]
     turned = proposals.motion[:, :3, :3] @ here.found.poses[proposals.mover, :3, :3]
     urgent += here.held(turned, here.up[proposals.stayer])
-    left = np.ones(len(proposals.mover), bool)
+    tried = proposals.most_urgent(urgent, TRIED)
     moves: list[Move] = []
-    while left.any() and len(moves) < TRIED:
-        moves.append(_best_cut(here, proposals, proposals.next(left, urgent)))
+    together = max(TOGETHER // max(len(here.pairs), 1), 1)
+    for first in range(0, len(tried), together):
+        moves += _best_moves(here, Trial.of(here, proposals, tried[first : first + together]))
     least = LEAST_GAIN if evidence.exhaustive else LEAST_OF_FEW
     better = sorted((move for move in moves if move.gain > least), key=lambda move: -move.gain)
     return _apart(better, len(here.found.piece))
@@ -111,52 +115,86 @@ def _apart(moves: list[Move], count: int) -> list[Move]:
     return chosen
 
 
-def _best_cut(here: Placements, proposals: Proposals, row: int) -> Move:
-    """The best set of views to move as one proposal and those that agree with it have it."""
-    poses, piece = here.found.poses, here.found.piece
-    stayer = proposals.stayer[row]
-    home, movable = piece[stayer], piece == piece[proposals.mover[row]]
-    motion = proposals.mean_motion(*proposals.group(row), poses)
-    then = here.layers(motion) * (piece[here.pairs[:, 0]] == home)
-    rotations = poses[:, :3, :3]
-    up = np.broadcast_to(here.up[stayer], here.up.shape)
-    held = here.held(motion[:3, :3] @ rotations, up) - here.held(rotations, here.up)
-    sets = [_cut(here, then, held, movable, through) for through in CUT_THROUGH]
-    if home != piece[proposals.mover[row]]:
-        sets.append(movable)
-    gains = [_gain(here, then, held, inside) for inside in sets]
-    best = int(np.argmax(gains))
-    return Move(gains[best], sets[best], motion, int(home), proposals.stayer[proposals.group(row)[0]])
+@dataclass(frozen=True)
+class Trial:
+    """A motion (4, 4) of the world that a group of edges proposes for the views `movable (V,)`, into a piece.
+
+    `then (3, P)`: the layers of all pairs whose second view has it; `held (V,)`: by how many nats views are held
+    better; `is_apart`: whether these are in another piece; `beside`: views that the edges join them to.
+    """
+
+    motion: Floats
+    piece: int
+    movable: Bools
+    is_apart: bool
+    then: Floats
+    held: Floats
+    beside: Ints
+
+    @classmethod
+    def of(cls, here: Placements, proposals: Proposals, rows: list[int]) -> list[Trial]:
+        """What each of these proposals, and those that agree with it, ask for."""
+        piece, rotations = here.found.piece, here.found.poses[:, :3, :3]
+        motions = proposals.mean_motions(rows, here.found.poses)
+        out = []
+        for row, motion, then in zip(rows, motions, here.layers(motions), strict=True):
+            stayer, moving = proposals.stayer[row], piece[proposals.mover[row]]
+            home, beside = piece[stayer], proposals.stayer[proposals.group(row)[0]]
+            up = np.broadcast_to(here.up[stayer], here.up.shape)
+            held = here.held(motion[:3, :3] @ rotations, up) - here.held(rotations, here.up)
+            then = then * (piece[here.pairs[:, 0]] == home)
+            out.append(cls(motion, int(home), piece == moving, bool(home != moving), then, held, beside))
+        return out
 
 
-def _gain(here: Placements, then: Floats, held: Floats, inside: Bools) -> float:
-    """What is gained by moving these views (V,), where the layers (3, P) of all pairs would then be these."""
+def _best_moves(here: Placements, trials: list[Trial]) -> list[Move]:
+    """The best set of views to move for each trial."""
+    out = []
+    for trial, sets in zip(trials, _cuts(here, trials), strict=True):
+        if trial.is_apart:
+            sets = np.concatenate([sets, trial.movable[None]])
+        gains = [_gain(here, trial, inside) for inside in sets]
+        best = int(np.argmax(gains))
+        out.append(Move(gains[best], sets[best], trial.motion, trial.piece, trial.beside))
+    return out
+
+
+def _gain(here: Placements, trial: Trial, inside: Bools) -> float:
+    """What is gained by moving these views (V,)."""
     if not inside.any():
         return 0.0
     cut = ~inside[here.pairs[:, 0]] & inside[here.pairs[:, 1]]
-    change = log_evidence(then[:, cut].sum(axis=1)) - log_evidence(here.now[:, cut].sum(axis=1))
-    return float(change + held[inside].sum())
+    change = log_evidence(trial.then[:, cut].sum(axis=1)) - log_evidence(here.now[:, cut].sum(axis=1))
+    return float(change + trial.held[inside].sum())
 
 
-def _cut(here: Placements, then: Floats, held: Floats, movable: Bools, through: float) -> Bools:
-    """The views (V,) beyond the lightest cut: of pairs that it parts it costs what they lose by the motion, and of
-    views that move with it what they are held worse, `held (V,)`.
+def _cuts(here: Placements, trials: list[Trial]) -> Bools:
+    """The views (K, C, V) beyond the lightest cut, for each trial and each of `CUT_THROUGH`: of pairs that it parts it
+    costs what they lose by the motion, and of views that move with it what they are held worse.
+
+    All are cut in one network with one source and one sink: a call costs ten times what it takes to find the flow.
     """
-    count, (tail, head) = len(movable), here.pairs.T
-    change = then - here.now
-    lost = np.where(movable[head], -PER_FOLD / (1 + through) * change[0] - change[2], 0.0)
-    won, parted = PULL * np.maximum(-lost, 0.0), np.flatnonzero(lost > 0)
-    stays = np.bincount(tail, won, count) + np.where(movable, np.maximum(-held, 0.0), HELD_NATS)
-    moves = np.bincount(head, won, count) + np.where(movable, np.maximum(held, 0.0), 0.0)
-    source, sink, every = np.full(count, count), np.full(count, count + 1), np.arange(count)
-    ends = np.concatenate([tail[parted], source, every]), np.concatenate([head[parted], every, sink])
-    weight = np.ceil(UNIT * np.concatenate([lost[parted], stays, moves])).astype(np.int32)
-    capacity = csr_matrix((weight, ends), shape=(count + 2, count + 2))
-    left = capacity - maximum_flow(capacity, int(source[0]), int(sink[0])).flow
+    count, (tail, head) = len(here.found.piece), here.pairs.T
+    shape = len(trials), len(CUT_THROUGH), count
+    source, every = len(trials) * len(CUT_THROUGH) * count, np.arange(count)
+    tails, heads, weights = [], [], []
+    for first, (trial, through) in zip(range(0, source, count), product(trials, CUT_THROUGH), strict=True):
+        change, movable, held = trial.then - here.now, trial.movable, trial.held
+        lost = np.where(movable[head], -PER_FOLD / (1 + through) * change[0] - change[2], 0.0)
+        won, parted = PULL * np.maximum(-lost, 0.0), np.flatnonzero(lost > 0)
+        stays = np.bincount(tail, won, count) + np.where(movable, np.maximum(-held, 0.0), HELD_NATS)
+        moves = np.bincount(head, won, count) + np.where(movable, np.maximum(held, 0.0), 0.0)
+        tails += [first + tail[parted], np.full(count, source), first + every]
+        heads += [first + head[parted], first + every, np.full(count, source + 1)]
+        weights += [lost[parted], stays, moves]
+    weight = np.ceil(UNIT * np.concatenate(weights)).astype(np.int32)
+    ends = np.concatenate(tails), np.concatenate(heads)
+    capacity = csr_matrix((weight, ends), shape=(source + 2, source + 2))
+    left = capacity - maximum_flow(capacity, source, source + 1).flow
     left.eliminate_zeros()
-    inside = np.ones(count + 2, bool)
-    inside[breadth_first_order(left, int(source[0]), return_predecessors=False)] = False
-    return np.asarray(inside[:count] & movable)
+    inside = np.ones(source + 2, bool)
+    inside[breadth_first_order(left, source, return_predecessors=False)] = False
+    return np.asarray(inside[:source].reshape(shape) & np.stack([trial.movable for trial in trials])[:, None])
 
 
 SIGMAS_APART = 12.0
@@ -193,18 +231,22 @@ class Proposals:
         entry = slice(self.alike.indptr[row], self.alike.indptr[row + 1])
         return self.alike.indices[entry].astype(np.int64), self.alike.data[entry]
 
-    def next(self, left: Bools, urgent: Floats) -> int:
-        """The most urgent (P,) of those left (P,), from which it and all that propose the same are then gone."""
-        row = int(np.argmax(np.where(left, urgent, -np.inf)))
-        group, alike = self.group(row)
-        left[group[alike > 0.5]] = False
-        left[row] = False
-        return row
+    def most_urgent(self, urgent: Floats, most: int) -> list[int]:
+        """The most urgent (P,) of those that propose other motions than the ones before, up to so many."""
+        left, out = np.ones(len(urgent), bool), list[int]()
+        while left.any() and len(out) < most:
+            out.append(row := int(np.argmax(np.where(left, urgent, -np.inf))))
+            group, alike = self.group(row)
+            left[group[alike > 0.5]] = False
+            left[row] = False
+        return out
 
-    def mean_motion(self, group: Ints, share: Floats, poses: Floats) -> Floats:
-        """The mean (4, 4) of the motions of a group, each counting its share."""
-        one = np.zeros(len(group), np.int64)
-        return np.asarray(mean_motions(one, self.motion[group], poses[self.mover[group], :3, 3], share, 1)[0])
+    def mean_motions(self, rows: list[int], poses: Floats) -> Floats:
+        """The mean motions (K, 4, 4) of the groups of these proposals, each counting as it agrees."""
+        groups, shares = zip(*map(self.group, rows), strict=True)
+        which, group = np.repeat(np.arange(len(rows)), list(map(len, groups))), np.concatenate(groups)
+        points = poses[self.mover[group], :3, 3]
+        return np.asarray(mean_motions(which, self.motion[group], points, np.concatenate(shares), len(rows)))
 
 
 def _near_in_angle(evidence: Evidence, edge: Ints, motion: Floats) -> tuple[Ints, Ints]:

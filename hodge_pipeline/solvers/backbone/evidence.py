@@ -224,14 +224,17 @@ def _likeliest(value: Callable[[Floats, float], float], unit: float) -> tuple[Fl
     best, width = np.full(4, unit), FIRST
     top = value(best, unit)
     while width >= FINEST:
-        improved = False
-        for axis in range(4):
+        axis = still = 0
+        while still < len(best):
+            still += 1
             for sign in (-1, 1):
                 tried = best.copy()
-                tried[axis] += sign * width
+                tried[axis % len(best)] += sign * width
                 if (found := value(tried, unit)) > top:
-                    best, top, improved = tried, found, True
-        width = width if improved else width / 2
+                    best, top, still = tried, found, 0
+                    break
+            axis += 1
+        width /= 2
     return best, top
 
 
