@@ -186,9 +186,11 @@ def test_what_is_none_of_the_layouts(tmp_path: Path) -> None:
 
 
 def test_the_real_redwood_rendering(data_dir: Path) -> None:
-    source = check_reader(IclNuimReader(), data_dir / "icl_nuim/livingroom1_redwood")
+    folder, camera = data_dir / "icl_nuim/livingroom1_redwood", (525.0, 525.0, 319.5, 239.5)
+    source = check_reader(IclNuimReader(camera=camera), folder)  # none that is assumed is tried on the images
     assert len(source.frames) == 211
-    assert source.frames[0].camera == Camera(640, 480, 525, 525, 319.5, 239.5)
+    assumed = IclNuimReader().open(folder)
+    assert source.frames[0].camera == assumed.frames[0].camera == Camera(640, 480, *camera) and not assumed.doubts
     first, later = source.frames[0], source.frames[10]
     right = se3.inverse(first.world_from_cam) @ later.world_from_cam
     wrong = first.world_from_cam @ se3.inverse(later.world_from_cam)

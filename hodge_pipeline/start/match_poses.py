@@ -25,14 +25,17 @@ CALIBRATED = {"tum": "slam_refine_tum"}
 """Recipes for the readers of formats whose depth and colour are calibrated to each other, where landmarks measure."""
 
 
-def recipe_for(frames: Path) -> str:
-    """The recipe that refines poses of these frames, by their format; that for scans where no frame has a camera."""
+def recipe_for(frames: Path, source: Source | None = None) -> str:
+    """The recipe that refines poses of these frames, by their format; that for scans where no frame has a camera.
+
+    `source`: what their reader opened, where that is done already.
+    """
     found = guesses(frames) if frames.exists() else []
     if not found:
         return RECIPE
     if found[0].name in CALIBRATED:
         return CALIBRATED[found[0].name]
-    return recipe_of(guess_reader(frames, found).open(frames).frames)
+    return recipe_of((source or guess_reader(frames, found).open(frames)).frames)
 
 
 def recipe_of(frames: Sequence[Frame]) -> str:

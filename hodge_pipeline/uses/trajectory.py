@@ -92,7 +92,7 @@ def refine_trajectory(
     open3d = not isinstance(poses, (np.ndarray, list, tuple))
     given = poses_of(poses) if open3d else np.asarray(poses, float)
     source = _source(frames, given)
-    chosen = recipe or (recipe_for(Path(frames)) if isinstance(frames, (str, Path)) else recipe_of(frames))
+    chosen = recipe or (recipe_for(Path(frames), source) if isinstance(frames, (str, Path)) else recipe_of(frames))
     ours = ["start.stage=given", f"guard.force={str(force).lower()}"]
     loaded = load_recipe(chosen, [*ours, *overrides])
     with tempfile.TemporaryDirectory(prefix="hodge-refine-") as scratch:
