@@ -14,7 +14,8 @@ from hodge_adapters.colmap.models import ColmapModels
 from hodge_adapters.colmap.ties import similarity
 from hodge_pipeline import se3
 from hodge_pipeline.refine.model_solve import calibrated
-from test_refine_colmap import FREE
+from hodge_pipeline.types import Floats, ViewGraph
+from test_refine_colmap import FREE, thinned
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 from colmap import MOST_WORSE_PERCENT, PEER, compared, cpu_of, disturbed, same_bytes
@@ -62,18 +63,8 @@ def test_a_join_is_as_exact_as_the_images_that_both_models_have(data_dir: Path) 
     assert found is not None and found[0].scale == pytest.approx(0.5, rel=1e-9)
 
 
-def thinned(good: Path, out: Path, keep: int) -> Path:
-    """The model with one of so many of its points; of all, poses come back to 0.01 % (benchmarks/colmap.py)."""
-    model = pycolmap.Reconstruction(good)
-    for number, key in enumerate(sorted(model.points3D)):
-        if number % keep:
-            model.delete_point3D(key)
-    out.mkdir()
-    model.write(out)
-    return out
-
-
 def test_poses_come_back_where_the_points_are_wrong_as_well(data_dir: Path, tmp_path: Path) -> None:
+    """A quarter of its points: of all, poses come back to 0.01 % (benchmarks/colmap.py)."""
     good = thinned(data_dir / "colmap/disturbed/mouse_good", tmp_path / "good", 4)
     out = tmp_path / "out"
     (start,) = disturbed(good, tmp_path / "start", "carried", 0)
@@ -84,21 +75,26 @@ def test_poses_come_back_where_the_points_are_wrong_as_well(data_dir: Path, tmp_
     assert len(done.results[0].candidates) > 2
 
 
-def test_edges_of_shared_points_are_right(data_dir: Path, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def measured(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Floats, ViewGraph]:
+    """Right poses of a model, and the edges of the same one with every pose wrong."""
     good = data_dir / "colmap/disturbed/mouse_good"
-    (start,) = disturbed(good, tmp_path / "start", "big", 0)
+    (start,) = disturbed(good, tmp_path_factory.mktemp("measured") / "start", "big", 0)
     (right,), (model,) = (ColmapModels(database="none", images="none").open_models(one) for one in (good, start))
     graph, _ = model.measured()
+    return right.world_from_body, graph
+
+
+def test_edges_of_shared_points_are_right(measured: tuple[Floats, ViewGraph]) -> None:
+    poses, graph = measured
     i, j = graph.edges.T
-    poses = right.world_from_body
     turn = se3.so3_log((se3.inverse(graph.i_from_j) @ se3.inverse(poses[i]) @ poses[j])[:, :3, :3])
     angle_deg = np.degrees(np.linalg.norm(turn, axis=1))
     assert len(angle_deg) > 500 and angle_deg.max() < 10 and np.median(angle_deg) < 0.3
 
 
-def test_the_noise_of_edges_is_that_of_their_cycles_whatever_the_poses(data_dir: Path) -> None:
-    (model,) = ColmapModels(database="none", images="none").open_models(data_dir / "colmap/disturbed/mouse_good")
-    graph, _ = model.measured()
-    disturbed_poses = model.world_from_body @ se3.exp(np.random.default_rng(0).normal(scale=0.1, size=(56, 6)))
-    right, wrong = (calibrated(graph, poses).information for poses in (model.world_from_body, disturbed_poses))
+def test_the_noise_of_edges_is_that_of_their_cycles_whatever_the_poses(measured: tuple[Floats, ViewGraph]) -> None:
+    poses, graph = measured
+    disturbed_poses = poses @ se3.exp(np.random.default_rng(0).normal(scale=0.1, size=(56, 6)))
+    right, wrong = (calibrated(graph, each).information for each in (poses, disturbed_poses))
     np.testing.assert_array_equal(right, wrong)
