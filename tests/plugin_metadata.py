@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+import pytest
 
 
 def write_metadata(package: Path, folder: Path) -> None:
@@ -15,3 +21,24 @@ def write_metadata(package: Path, folder: Path) -> None:
     groups = project["entry-points"].items()
     lines = [f"[{group}]\n" + "".join(f"{key} = {value}\n" for key, value in names.items()) for group, names in groups]
     (metadata / "entry_points.txt").write_text("\n".join(lines))
+
+
+@contextmanager
+def installed(*folders: Path) -> Iterator[None]:
+    """Packages with their metadata found by this process and by those it starts; afterwards they were never there."""
+    from hodge_pipeline import registry
+
+    before = set(sys.modules)
+    paths = [*map(str, folders), *filter(None, [os.environ.get("PYTHONPATH")])]
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("PYTHONPATH", os.pathsep.join(paths))
+            for folder in folders:
+                patch.syspath_prepend(str(folder))
+            registry._entries.cache_clear()
+            yield
+    finally:
+        registry._entries.cache_clear()
+        for name in set(sys.modules) - before:
+            if Path(getattr(sys.modules[name], "__file__", None) or ".").parent in folders:
+                del sys.modules[name]

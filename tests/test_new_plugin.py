@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import subprocess
@@ -11,28 +12,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from command import hodge
 from hodge_pipeline import registry
 from hodge_pipeline.cli.new_plugin import EXAMPLES, plugin_files, write_plugin
 from hodge_pipeline.errors import RecipeError, WorkspaceError
-from plugin_metadata import write_metadata
+from plugin_metadata import installed, write_metadata
 from synthetic import LIGHT, short_sequence  # noqa: F401 - a fixture
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "writing-a-plugin.md"
+KINDS = {"registration": "o3d_icp", "readers": "npz_folder"}
 RUFF = ["check", "--select", "E,F,I,UP,B,SIM,D1"], ["format", "--check"]
 SMALL = (*LIGHT, "fusion=[]", "recording.level=off", "start.relocalise=false")
 
 
-def python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    """Python in a folder with a package, which it finds as if it were installed."""
-    path = os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
-    environment = {**os.environ, "PYTHONPATH": path}
+def python(folder: Path, packages: list[Path], *words: str) -> subprocess.CompletedProcess[str]:
+    """Python in a folder, with packages that it finds as if they were installed."""
+    path = os.pathsep.join([*map(str, packages), *filter(None, [os.environ.get("PYTHONPATH")])])
     return subprocess.run(
-        [sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True, check=False
-    )
-
-
-def hodge(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    return python(folder, "-m", "hodge_pipeline.cli.main", *words)
+        [sys.executable, *words], cwd=folder, env={**os.environ, "PYTHONPATH": path},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
 
 
 def made(folder: Path, name: str, kind: str) -> Path:
@@ -42,26 +41,27 @@ def made(folder: Path, name: str, kind: str) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module", params=["o3d_icp", "npz_folder"])
-def package(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    kind = "registration" if request.param == "o3d_icp" else "readers"
-    return made(tmp_path_factory.mktemp("new") / request.param, request.param, kind)
+@pytest.fixture(scope="module")
+def packages(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """A package of each kind."""
+    folder = tmp_path_factory.mktemp("new")
+    return [made(folder / name, name, kind) for kind, name in KINDS.items()]
 
 
-def test_it_passes_its_own_test_and_the_linter(package: Path) -> None:
-    done = python(package, "-m", "pytest", "-q", "-p", "no:cacheprovider")
+def test_they_pass_their_own_tests_and_the_linter(packages: list[Path]) -> None:
+    done = python(packages[0].parent, packages, "-m", "pytest", "-q", "-p", "no:cacheprovider", *map(str, packages))
     assert done.returncode == 0, done.stdout
-    assert "1 passed" in done.stdout
-    for command in RUFF:
-        linted = python(package, "-m", "ruff", *command, "--isolated", "--line-length", "120")
+    assert f"{len(packages)} passed" in done.stdout
+    for package, command in itertools.product(packages, RUFF):
+        linted = python(package, [], "-m", "ruff", *command, "--isolated", "--line-length", "120")
         assert linted.returncode == 0, linted.stdout
 
 
-def test_it_is_listed_with_its_package(package: Path) -> None:
-    name = package.name
-    kind = "registration" if name == "o3d_icp" else "readers"
-    listed = hodge(package, "stages", kind)
-    assert f"[hodge-{name.replace('_', '-')} 0.1.0]" in listed.stdout, listed.stderr
+def test_they_are_listed_with_their_packages(packages: list[Path]) -> None:
+    with installed(*packages):
+        for kind, name in KINDS.items():
+            listed = hodge("stages", kind)
+            assert f"[hodge-{name.replace('_', '-')} 0.1.0]" in listed.stdout, listed.stderr
 
 
 def test_a_run_registers_with_it_and_its_error_names_it(
@@ -71,7 +71,8 @@ def test_a_run_registers_with_it_and_its_error_names_it(
     package = made(tmp_path / "package", "o3d_icp", "registration")
     sets = [word for change in (*SMALL, "registration=o3d_icp") for word in ("--set", change)]
     run = ["run", "demo", "--source", str(short_sequence), *sets]
-    done = hodge(package, *run, "--set", "executor.workers=0", "--out", str(tmp_path / "good"))
+    with installed(package):
+        done = hodge(*run, "--set", "executor.workers=0", "--out", tmp_path / "good")
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("verdict")
 
@@ -79,7 +80,8 @@ def test_a_run_registers_with_it_and_its_error_names_it(
     module.write_text(module.read_text().replace("        steps = 0\n", '        raise ValueError("no\\nluck")\n'))
     line = module.read_text().splitlines().index('        raise ValueError("no\\nluck")') + 1
     # in a worker, whose errors come back without frames
-    done = hodge(package, *run, "--set", "executor.workers=1", "--out", str(tmp_path / "bad"), "--quiet")
+    with installed(package):
+        done = hodge(*run, "--set", "executor.workers=1", "--out", tmp_path / "bad", "--quiet")
     assert done.returncode == 1
     said = f"stage o3d_icp (hodge-o3d-icp 0.1.0) raised ValueError: no luck, at hodge_o3d_icp.py:{line}"
     assert done.stderr == f"error: {said}\n"
@@ -90,11 +92,13 @@ def test_a_reader_opens_its_format_and_its_error_names_it(tmp_path: Path) -> Non
     data = tmp_path / "data"
     data.mkdir()
     np.savez(data / "0.npz", points=np.random.default_rng(0).uniform(0, 2, (100, 3)))
-    done = hodge(package, "inspect", str(data), "--reader", "npz_folder")
+    with installed(package):
+        done = hodge("inspect", data, "--reader", "npz_folder")
     assert done.returncode == 0 and re.search(r"^frames +1$", done.stdout, re.M), done.stdout + done.stderr
     module = package / "hodge_npz_folder.py"
     module.write_text(module.read_text().replace("        frames = tuple(", "        frames = 1 / 0, *("))
-    done = hodge(package, "inspect", str(data), "--reader", "npz_folder")
+    with installed(package):
+        done = hodge("inspect", data, "--reader", "npz_folder")
     assert done.returncode == 1
     assert done.stderr.startswith("error: stage npz_folder (hodge-npz-folder 0.1.0) raised ZeroDivisionError: division")
     assert done.stderr.count("\n") == 1

@@ -3,33 +3,42 @@
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from command import hodge
 from hodge_pipeline import registry
+from plugin_metadata import installed
 from synthetic import LIGHT, short_sequence  # noqa: F401 - a fixture
 
 PACKAGE = Path(__file__).parent / "plugin_package"
 
 
 @pytest.fixture(scope="module")
-def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """The environment in which the package is installed."""
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which the package is installed."""
     site = tmp_path_factory.mktemp("site")
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--target"]
     subprocess.run([*pip, str(site), str(PACKAGE)], check=True, capture_output=True)
-    here = [os.environ[name] for name in ("PYTHONPATH",) if name in os.environ]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), *here])}
+    return site
 
 
-def hodge(environment: dict[str, str], *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "hodge_pipeline.cli.main", *arguments]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+@pytest.fixture
+def environment(site: Path) -> Iterator[None]:
+    """The environment in which the package is installed."""
+    with installed(site):
+        yield
 
 
-def test_it_is_listed_and_the_broken_one_is_named(environment: dict[str, str]) -> None:
-    listed = hodge(environment, "stages", "edges")
+def test_it_is_listed_and_the_broken_one_is_named(site: Path) -> None:
+    """In a process of its own, as a user's shell starts one."""
+    paths = [str(site), *filter(None, [os.environ.get("PYTHONPATH")])]
+    listed = subprocess.run(
+        [sys.executable, "-m", "hodge_pipeline.cli.main", "stages", "edges"],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
     assert listed.returncode == 0
     assert "ring" in listed.stdout
     assert "[hodge-plugin-example 0.3.0]" in listed.stdout
@@ -37,22 +46,24 @@ def test_it_is_listed_and_the_broken_one_is_named(environment: dict[str, str]) -
     assert "overlap" in listed.stdout
 
 
-def test_it_runs_from_a_recipe(environment: dict[str, str], short_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
+@pytest.mark.usefixtures("environment")
+def test_it_runs_from_a_recipe(short_sequence: Path, tmp_path: Path) -> None:  # noqa: F811
     recipe = tmp_path / "ring.yaml"
     recipe.write_text("extends: demo\nedges: {stage: ring, reach: 1}\nfusion: []\nrecording: {level: off}\n")
     sets = [word for change in LIGHT if not change.startswith("edges") for word in ("--set", change)]
     run = ["run", str(recipe), "--source", str(short_sequence), "--out", str(tmp_path / "run"), *sets]
-    ran = hodge(environment, *run)
+    ran = hodge(*run)
     assert ran.returncode == 0, ran.stderr
     rows = (tmp_path / "run/edges.csv").read_text().splitlines()[1:]
     assert len(rows) == 8
     assert all(row.split(",")[2] == "ring" for row in rows)
 
 
-def test_naming_the_broken_one_is_one_line(environment: dict[str, str], tmp_path: Path) -> None:
+@pytest.mark.usefixtures("environment")
+def test_naming_the_broken_one_is_one_line(tmp_path: Path) -> None:
     recipe = tmp_path / "broken.yaml"
     recipe.write_text("extends: demo\nedges: {stage: broken}\n")
-    ran = hodge(environment, "run", str(recipe), "--source", str(tmp_path), "--out", str(tmp_path / "run"))
+    ran = hodge("run", recipe, "--source", tmp_path, "--out", tmp_path / "run")
     assert ran.returncode == 1
     assert ran.stderr.startswith(
         f"error: {recipe}:2: edges: stage 'broken' of kind 'edges' (hodge-plugin-example 0.3.0)"
@@ -60,8 +71,9 @@ def test_naming_the_broken_one_is_one_line(environment: dict[str, str], tmp_path
     assert ran.stderr.count("\n") == 1
 
 
-def test_its_schema_leaves_the_broken_one_out(environment: dict[str, str]) -> None:
-    schema = hodge(environment, "recipes", "--schema")
+@pytest.mark.usefixtures("environment")
+def test_its_schema_leaves_the_broken_one_out() -> None:
+    schema = hodge("recipes", "--schema")
     assert schema.returncode == 0
     assert '"ring"' in schema.stdout
     assert '"broken"' not in schema.stdout

@@ -23,7 +23,7 @@ from mcap_scene import BEGIN_S, write_clouds
 from readers_data import points_in_cam
 
 SMALL = (
-    "clouds.voxel_m=0.06", "executor.workers=0", "recording.level=off", "outer_iterations=1", "start.every=2",
+    "clouds.voxel_m=0.1", "executor.workers=0", "recording.level=off", "outer_iterations=1", "start.every=2",
     "evaluation.tables=false",
     "edges.builders=[{stage: sequential}, {stage: overlap, min_iou: 0.15}]",
 )  # fmt: skip
