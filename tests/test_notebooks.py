@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import nbformat
 import pytest
 import rerun.notebook
+from jupyter_client.manager import KernelManager
 from nbclient import NotebookClient
 
 import hodge_pipeline
@@ -34,12 +36,22 @@ def test_there_is_a_notebook_for_each_user() -> None:
     assert {path.stem for path in NOTEBOOKS} == {*LAST_WORDS}
 
 
+@pytest.fixture(scope="module")
+def kernel() -> Iterator[KernelManager]:
+    """One for all notebooks, which keeps what they import: a start with all libraries costs seconds."""
+    manager = KernelManager()
+    manager.start_kernel()
+    yield manager
+    manager.shutdown_kernel(now=True)
+
+
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_it_runs_as_it_is(path: Path, tmp_path: Path) -> None:
+def test_it_runs_as_it_is(path: Path, kernel: KernelManager, tmp_path: Path) -> None:
     notebook = nbformat.read(path, 4)
     assert not any(cell.get("outputs") for cell in notebook.cells), "kept without outputs"
-    client = NotebookClient(notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": tmp_path}})
-    client.execute()
+    for cells in ([nbformat.v4.new_code_cell(f"%reset -f\n%cd {tmp_path}")], notebook.cells):  # as of a new kernel
+        notebook.cells = cells
+        NotebookClient(notebook, timeout=300, km=kernel).execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     shown = "".join(output.get("text") or output.get("data", {}).get("text/plain", "") for output in outputs)
     assert LAST_WORDS[path.stem] in shown
