@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import re
 import runpy
 import shlex
 import shutil
-import subprocess
-import sys
-import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +15,7 @@ import typer.main
 import hodge_pipeline
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.recipe.schema import load_recipe
-from plugin_metadata import write_metadata
+from plugin_metadata import installed, write_metadata
 from synthetic import LIGHT, short_sequence  # noqa: F401 - a fixture
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -140,18 +136,8 @@ def test_the_example_package_is_installed_and_runs(workplace: Path, tmp_path: Pa
     shutil.copy(EXAMPLE / "far_loops.py", site)
     write_metadata(EXAMPLE, site)
     near = "edges.builders=[{stage: sequential}, {stage: far_loops, gap: 5, max_distance_m: 0.5}]"
-    script = textwrap.dedent(f"""
-        import hodge_pipeline
-        from hodge_pipeline.recipe.schema import load_recipe
-        changes = {[*SMALL, "recording.level=off", near]!r}
-        recipe = load_recipe({str(EXAMPLE / "far_loops.yaml")!r}, changes)
-        hodge_pipeline.run(recipe, "run", source={str(workplace / "SEQUENCE")!r})
-    """)
-    here = [os.environ[name] for name in ("PYTHONPATH",) if name in os.environ]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path / "site"), *here])}
-    ran = subprocess.run(
-        [sys.executable, "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-    )
-    assert ran.returncode == 0, ran.stderr
+    with installed(site):
+        recipe = load_recipe(str(EXAMPLE / "far_loops.yaml"), [*SMALL, "recording.level=off", near])
+        hodge_pipeline.run(recipe, tmp_path / "run", source=workplace / "SEQUENCE")
     edges = (tmp_path / "run/edges.csv").read_text()
     assert "far loop" in edges and "sequential" in edges

@@ -23,6 +23,7 @@ from hodge_pipeline.uses.recipe_run import solve_again
 NAMES = (
     "<script>alert(1)</script>", "\"><img src=x onerror=alert(1)>", "=HYPERLINK(\"http://x\")", "\x1b[31mred", "a\nb",
     "../../outside", "a/b", "-rf", "{count}", "[bold]x[/]", "x" * 200, "'", "\u202eevil", "@SUM(A1)", "café", "a b",
+    "=SUM(A1)\n<script>alert(1)</script>",
 )  # fmt: skip
 OUTSIDE = "what is outside"
 
