@@ -1,6 +1,6 @@
 """Recordings that are cut, damaged or lie: read as far as they go, or refused in one line; never more memory than said.
 
-`HODGE_MCAP_CASES` sets how many random damages are tried (240).
+`HODGE_MCAP_CASES` sets how many random damages are tried (144).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from mcap_encoding import CDR, JSON, PROTOBUF
 from mcap_scene import everything
 from readers_data import HEIGHT, WIDTH, depth_values
 
-CASES = int(os.environ.get("HODGE_MCAP_CASES", "240"))
+CASES = int(os.environ.get("HODGE_MCAP_CASES", "144"))
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 
 

@@ -18,7 +18,7 @@ PYPROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))
 WORKFLOWS = sorted((REPOSITORY / ".github" / "workflows").glob("*.yml"))
 MAKEFILE = (REPOSITORY / "Makefile").read_text("utf-8")
 TARGETS = set(re.findall(r"^([a-z-]+):", MAKEFILE, re.M))
-QUICK = "tests/test_se3.py", "tests/test_yaml_and_recipes.py", "tests/test_python_versions.py"
+QUICK = "tests/test_yaml_and_recipes.py", "tests/test_python_versions.py"
 
 
 def test_the_citation_is_of_this_version() -> None:
