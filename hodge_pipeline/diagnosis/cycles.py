@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hodge_pipeline.complex.closing import cycle_errors
 from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -34,6 +35,15 @@ def judge_cycles(loops: Loops, angle: Floats, displacement_m: Floats, noise: Noi
     swing = turn * (reach_m * loops.lengths) ** 2 / 12
     chi2 = angle**2 / np.maximum(turn, 1e-300) + displacement_m**2 / np.maximum(shift + swing, 1e-300)
     return Cycles(loops, angle, displacement_m, chi2, chi2 < GATE)
+
+
+def close_by_chance(cycles: Cycles, i_from_j: Floats, noise: Noise, reach_m: float) -> bool:
+    """Whether the cycles close no more often than with the motions (E, 4, 4) dealt anew among their edges: where most
+    edges are wrong, or errors as large as motions, cycles that close say nothing.
+    """
+    dealt = i_from_j[np.random.default_rng(0).permutation(len(i_from_j))]
+    others = judge_cycles(cycles.loops, *cycle_errors(cycles.loops, dealt), noise, reach_m)
+    return int(cycles.closes.sum()) <= int(others.closes.sum())
 
 
 def usual_share(cycles: Cycles) -> float:

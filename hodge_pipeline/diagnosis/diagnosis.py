@@ -14,7 +14,7 @@ from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.complex.judging import in_vertex_order
 from hodge_pipeline.complex.short_cycles import with_cycles_of
 from hodge_pipeline.diagnosis.consensus import agreeing, find_consensus, sought_from
-from hodge_pipeline.diagnosis.cycles import Cycles, judge_cycles, witnesses
+from hodge_pipeline.diagnosis.cycles import Cycles, close_by_chance, judge_cycles, witnesses
 from hodge_pipeline.diagnosis.evidence import Evidence, every_pair_tried, gather
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.on_backbone import judged_on_backbone
@@ -66,6 +66,9 @@ def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbo
     judged = _ByCycles.of(graph, options)
     if options.trust != AUTO or not graph.edge_count:
         return judged.found
+    evidence = judged.evidence
+    if close_by_chance(judged.cycles, evidence.graph.i_from_j, evidence.noise, evidence.reach_m):
+        return backbone or find_backbone(graph, anyway=True) or judged.found
     backbone, explains_more = backbone_anyway(graph, judged.found.kept, backbone)
     if backbone is None or explains_more:
         return backbone or judged.found
