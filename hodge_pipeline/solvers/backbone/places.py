@@ -31,8 +31,6 @@ a path that closes once would stay open: its loops can say little more than that
 ROUNDS = 6
 MOST_TRIED = 3
 """Places that are left out on trial each time, and groups of unused loops that may be added: limits on cost."""
-TOGETHER = 20
-"""Of so many places one is left out at once: a limit on cost, where hundreds of random loops may be right."""
 CLEARLY = float(np.log(20.0))
 """Log-odds that a change must win."""
 ADJACENT = 2.0
@@ -191,8 +189,8 @@ class Places:
 
     def _changes(self, found: Arrangement) -> list[Bools]:
         """Arrangements (K,) that differ in one place and may be likelier: without one that is likelier mistaken by all
-        others, those that bend most first, where places are many the worst of these at once; with one more. None where
-        there are more places than are solved together, since other ones would be then.
+        others, those that bend most first; with one more. None where there are more places than are solved together,
+        since other ones would be then.
         """
         each, out = np.arange(len(self.loop)), list[Bools]()
         if len(found.fit.reduced.active) < found.right.sum():
@@ -203,10 +201,7 @@ class Places:
             log_density, chi2 = student(residual, covariance)
             worth = log_density - self._away(found.fit) - self.rivals(found.right)[active] + np.log(MISTAKEN_PLACES)
             bent = np.argsort(-chi2, kind="stable")
-            bent = active[bent[worth[bent] < 0]]
-            many = bent[: len(active) // TOGETHER]
-            out = [found.right & ~np.isin(each, many)] if len(many) > 1 else []
-            out += [found.right & (each != place) for place in bent[:MOST_TRIED]]
+            out = [found.right & (each != place) for place in active[bent[worth[bent] < 0][:MOST_TRIED]]]
         return out + [found.right | (each == place) for place in np.flatnonzero(~self.used & ~found.right)]
 
 
