@@ -8,6 +8,7 @@ import numpy as np
 
 from hodge_pipeline.complex.closing import cycle_errors
 from hodge_pipeline.complex.cycles import Loops
+from hodge_pipeline.complex.judging import MEDIAN_CHI2
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -15,8 +16,8 @@ GATE = 30.0
 """χ² over six dimensions of a cycle that closes, and of two edges that agree. Generous, since tails are heavy."""
 WITNESSES = 3
 SIGMAS = 4.0
-"""By which more cycles must close than do by chance. In eight graphs of the literature 26 and more do; where all their
-loops are random 1 at the most, but for 60 in one that has parallel edges.
+"""By which more cycles must close well than do by chance: in graphs of the literature and in lattices with wrong edges
+11 and more do, where all loops are random 3 at the most.
 """
 
 
@@ -42,13 +43,13 @@ def judge_cycles(loops: Loops, angle: Floats, displacement_m: Floats, noise: Noi
 
 
 def close_by_chance(cycles: Cycles, i_from_j: Floats, noise: Noise, reach_m: float) -> bool:
-    """Whether the cycles close no more often than with the motions (E, 4, 4) dealt anew among their edges: where most
-    edges are wrong, or errors as large as motions, cycles that close say nothing.
+    """Whether cycles close well, as half of right ones do, no more often than with the motions (E, 4, 4) dealt anew
+    among their edges: where most of these are wrong, or errors as large as motions, cycles that close say nothing.
     """
     dealt = i_from_j[np.random.default_rng(0).permutation(len(i_from_j))]
     others = judge_cycles(cycles.loops, *cycle_errors(cycles.loops, dealt), noise, reach_m)
-    count, chance = max(len(cycles.closes), 1), float(others.closes.sum())
-    return bool(cycles.closes.sum() <= chance + SIGMAS * np.sqrt(chance * (1 - chance / count)))
+    well, chance = (int((each.chi2 < MEDIAN_CHI2[6]).sum()) for each in (cycles, others))
+    return bool(well <= chance + SIGMAS * np.sqrt(chance * (1 - chance / max(len(cycles.chi2), 1))))
 
 
 def usual_share(cycles: Cycles) -> float:
