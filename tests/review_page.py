@@ -18,7 +18,6 @@ PATIENCE_S = 120.0
 FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--disable-background-networking",
-    "--webgl-antialiasing-mode=none", "--force-device-scale-factor=0.5",
 )  # fmt: skip
 
 

@@ -41,6 +41,8 @@ FRAMES, REACH, STEP_SIGMA = 60, 2, 0.003
 RIGHT, MISTAKEN = ((1, 54), (3, 56), (5, 58)), ((4, 31), (5, 32), (6, 33))
 """As in docs/which-edge.md, of half as many frames."""
 PLANTED = {f"{i}-{j}" for i, j in MISTAKEN}
+COARSE = "--webgl-antialiasing-mode=none", "--force-device-scale-factor=0.5"
+"""Nobody looks at these pages, which are drawn without a GPU."""
 SMALL = (
     "outer_iterations=1", f"edges={{stage: sequential, reach: {REACH}}}", "evaluation.tables=false",
     "clouds.voxel_m=0.06", "fusion=[{stage: cloud}]", "executor.workers=0", "recording.level=off",
@@ -77,7 +79,7 @@ def run_folder(spoiled_run: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
-    found = start_browser(1000, 800)
+    found = start_browser(1000, 800, *COARSE)
     yield found
     found.quit()
 

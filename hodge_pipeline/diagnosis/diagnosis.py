@@ -66,14 +66,13 @@ def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbo
     judged = _ByCycles.of(graph, options)
     if options.trust != AUTO or not graph.edge_count:
         return judged.found
-    evidence = judged.evidence
-    if close_by_chance(judged.cycles, evidence.graph.i_from_j, evidence.noise, evidence.reach_m):
+    if judged.by_chance:
         return backbone or find_backbone(graph, anyway=True) or judged.found
     backbone, explains_more = backbone_anyway(graph, judged.found.kept, backbone)
     if backbone is None or explains_more:
         return backbone or judged.found
     # groups of wrong loops may have torn what its poses hold together
-    return judged.sought_from(backbone.world_from_cam).found if backbone.found.confirmed else judged.found
+    return judged.sought_from(backbone.world_from_cam) if backbone.found.confirmed else judged.found
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,6 @@ class _ByCycles:
     evidence: Evidence
     cycles: Cycles
     there: Floats
-    fit: Fit
 
     @classmethod
     def of(cls, stated: ViewGraph, options: DiagnosisOptions) -> _ByCycles:
@@ -95,16 +93,30 @@ class _ByCycles:
         graph, turned = in_vertex_order(stated)
         evidence, cycles, point = gather(graph, options)
         there = se3.from_parts(np.eye(3), point)
-        return cls(stated, turned, evidence, cycles, there, find_consensus(evidence))
+        return cls(stated, turned, evidence, cycles, there)
 
-    def sought_from(self, world_from_cam: Floats) -> _ByCycles:
-        """The same with the solution sought from these poses (V, 4, 4) too."""
-        return replace(self, fit=sought_from(self.evidence, self.fit, world_from_cam @ self.there))
+    @property
+    def by_chance(self) -> bool:
+        """Whether they say no more than chance would."""
+        known = self.evidence
+        return close_by_chance(self.cycles, known.graph.i_from_j, known.noise, known.reach_m)
+
+    @cached_property
+    def fit(self) -> Fit:
+        """The solution that most edges agree with."""
+        return find_consensus(self.evidence)
 
     @cached_property
     def found(self) -> Diagnosis:
         """The diagnosis that trusts no edge."""
-        stated, evidence, fit, there = self.stated, self.evidence, self.fit, self.there
+        return self._diagnosis(self.fit)
+
+    def sought_from(self, world_from_cam: Floats) -> Diagnosis:
+        """The same with the solution sought from these poses (V, 4, 4) too."""
+        return self._diagnosis(sought_from(self.evidence, self.fit, world_from_cam @ self.there))
+
+    def _diagnosis(self, fit: Fit) -> Diagnosis:
+        stated, evidence, there = self.stated, self.evidence, self.there
         agrees = agreeing(evidence, fit)
         cycles = _with_witnesses(self.cycles, fit.used, evidence)
         blame = share_blame(cycles, fit, evidence)
