@@ -88,6 +88,11 @@ def _estimate(
     if len(cameras) == 1:
         return pycolmap.estimate_and_refine_absolute_pose(pixels, xyz, cameras[0], options)
     cams_from_rig = [pycolmap.Rigid3d(np.ascontiguousarray(se3.inverse(pose)[:3])) for pose in body_from_cam]
-    return pycolmap.estimate_and_refine_generalized_absolute_pose(
-        pixels, xyz, row_of.tolist(), cams_from_rig, list(cameras), options.ransac
-    )
+    rig = row_of.tolist(), cams_from_rig, list(cameras)
+    found = pycolmap.estimate_generalized_absolute_pose(pixels, xyz, *rig, options.ransac)
+    if found is None:
+        return None
+    # its last digits hang on where memory lies, those of the refinement on its start alone
+    start = pycolmap.Rigid3d(found["rig_from_world"].matrix().astype(np.float32).astype(np.float64))
+    refined = pycolmap.refine_generalized_absolute_pose(start, pixels, xyz, found["inlier_mask"], *rig)
+    return None if refined is None else found | refined
