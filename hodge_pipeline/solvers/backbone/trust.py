@@ -94,7 +94,8 @@ class Backbone:
 
 def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) -> Backbone | None:
     """The backbone of a graph, None where it has none that should be trusted; `auto` takes none of a large lattice or
-    of a room, in which loops suffice, unless it is asked for one of these `anyway`, and of these alone.
+    of a room, in which loops suffice, unless it is asked for one of these `anyway`, and of these alone: then one none
+    of whose steps is broken.
 
     `trust`: `auto` learns from the graph whether its consecutive edges are one; `sequential` trusts them, `none` no
     edge; any other word those edges whose `source` it is. Raises `GraphError` where no edge is meant.
@@ -120,6 +121,7 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
         return None
     always = chosen[chain.loop_edge] if trust not in (AUTO, SEQUENTIAL) else np.zeros(len(chain.loop_edge), bool)
     most = FEW_BREAKS if trust == AUTO and many_loops else MOST_BREAKS
+    most = 0 if anyway else most
     inferred = infer_bridged(chain, always, trust != AUTO or anyway or not many_loops, most)
     if inferred is None:
         return None
