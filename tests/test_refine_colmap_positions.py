@@ -10,12 +10,15 @@ import pycolmap
 import pytest
 
 import hodge_pipeline
+from hodge_adapters.colmap.bodies import bodies_of
+from hodge_adapters.colmap.content import content_of
 from hodge_adapters.colmap.models import ColmapModels
 from hodge_adapters.colmap.priors import database_priors
+from hodge_adapters.colmap.resection import resected
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
-from test_refine_colmap import FREE
+from test_refine_colmap import FREE, noisy
 
 WORLD_FROM_MODEL = pycolmap.Sim3d(
     2.5, pycolmap.Rotation3d(se3.so3_exp(np.array([0.3, -1.0, 0.5]))), np.array([10.0, 20.0, 3.0])
@@ -181,3 +184,16 @@ def test_tables_that_are_none_are_named(tmp_path: Path, text: str, complaint: st
     (tmp_path / "gps.csv").write_text(text)
     with pytest.raises(SourceError, match=complaint):
         ColmapModels(positions=str(tmp_path / "gps.csv"), database="none").open_models(street(tmp_path / "model"))
+
+
+def test_a_rig_is_placed_by_its_points_far_from_the_origin_too(tmp_path: Path) -> None:
+    model = pycolmap.Reconstruction(noisy(tmp_path))
+    positions = []
+    for far_m in (0.0, 1e6):
+        model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array([far_m, -far_m, 0.0])))
+        records = content_of(model)
+        bodies = bodies_of(model, [image.image_id for image in records.images])
+        moved = resected(records, bodies)[:, :3, 3] - bodies.world_from_body[:, :3, 3]
+        assert moved.any(), "where RANSAC finds nothing, poses stay"
+        positions.append(moved)
+    np.testing.assert_allclose(positions[1], positions[0], atol=1e-6)

@@ -68,14 +68,16 @@ def _placed(model: Model, bodies: Bodies, rows: Ints) -> Floats | None:
     for at, image in enumerate(images):
         pixels[row_of == at] = model.images[image].pixels[model.points.columns[rows[row_of == at]]]
     xyz = model.points.xyz[model.points.owners[rows]]
+    centre = xyz.mean(axis=0)  # far from the origin pycolmap's solvers, and single precision, are too coarse
     cameras = [colmap_camera(model.cameras[model.images[image].camera_id]) for image in images]
-    found = _estimate(pixels, xyz, row_of, cameras, [bodies.body_from_cam[image] for image in images])
+    found = _estimate(pixels, xyz - centre, row_of, cameras, [bodies.body_from_cam[image] for image in images])
     if found is None or found["num_inliers"] < LEAST_INLIERS:
         return None
     key = "cam_from_world" if len(images) == 1 else "rig_from_world"
     pose = matrix_of(found[key])
     body_from_world = bodies.body_from_cam[images[0]] @ pose if len(images) == 1 else pose
     out = se3.inverse(body_from_world)
+    out[:3, 3] += centre
     return out if np.isfinite(out).all() else None
 
 

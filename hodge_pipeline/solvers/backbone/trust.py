@@ -120,8 +120,8 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
     if trust == AUTO and many_loops and not anyway and is_tested(chain):
         return None
     always = chosen[chain.loop_edge] if trust not in (AUTO, SEQUENTIAL) else np.zeros(len(chain.loop_edge), bool)
-    most = FEW_BREAKS if trust == AUTO and many_loops else MOST_BREAKS
-    most = 0 if anyway else most
+    few = 0 if anyway else FEW_BREAKS
+    most = few if trust == AUTO and many_loops else MOST_BREAKS
     inferred = infer_bridged(chain, always, trust != AUTO or anyway or not many_loops, most)
     if inferred is None:
         return None
