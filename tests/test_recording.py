@@ -370,6 +370,6 @@ def test_a_recording_without_room_is_one_line_and_never_waits_for_ever(
         except WorkspaceError as error:
             print(error)
     """)
-    done = subprocess.run([sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True, timeout=300)
     assert "the recording cannot be written" in done.stdout and done.returncode == 0, done.stderr
     assert list(tmp_path.iterdir()) == []

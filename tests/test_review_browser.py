@@ -148,8 +148,7 @@ def test_the_same_by_keyboard(browser: Any, review: Review, run_folder: Path) ->
     page.press("1")
     page.until(lambda: review.session.look.mode == "all")
     page.press("1")
-    _, middle = review.scene.overview(review.session.settled.world_from_cam)
-    page.until(lambda: np.allclose(page.scene.camera.look_at, middle, atol=1e-3))
+    looks_at_all(page)
 
 
 def test_a_line_clicked_in_the_scene_is_selected(browser: Any, review: Review) -> None:
@@ -223,9 +222,15 @@ def test_a_page_that_comes_later_looks_at_the_same_pair(browser: Any, review: Re
     page, session = Page(browser, review), review.session
     page.choose(sorted(PLANTED)[0])
     session.show(mode="edge")
+    arrived(page)
     browser.get("about:blank")
+    page.until(lambda: page.scene is None)
+    begins = page.review.viewer.server.initial_camera.look_at
+    assert np.allclose(begins, shown_pair(session, False).middle)  # type: ignore[union-attr]
     later = Page(browser, review)
     arrived(later)
+    session.show(mode="all")
+    looks_at_all(later)
 
 
 def test_the_second_cloud_fades_from_the_edges_place_to_the_solutions(browser: Any, review: Review) -> None:
@@ -255,6 +260,12 @@ def arrived(page: Page) -> None:
     middle = shown_pair(page.review.session, False).middle  # type: ignore[union-attr]
     page.until(lambda: np.allclose(page.scene.camera.look_at, middle, atol=1e-3))
     time.sleep(0.5)  # the position follows in a message of its own
+
+
+def looks_at_all(page: Page) -> None:
+    """Return when the page looks at the whole scene."""
+    _, middle = page.review.scene.overview(page.review.session.settled.world_from_cam)
+    page.until(lambda: np.allclose(page.scene.camera.look_at, middle, atol=1e-3))
 
 
 def matching(page: Page, i: int, j: int, i_from_j: Any) -> list[tuple[Any, Any]]:

@@ -61,11 +61,10 @@ class Scene:
     def _begin(self) -> None:
         """The scene of a subject that was just opened."""
         scene, poses = self._server.scene, self._session.settled.world_from_cam
-        position, centre = self.overview(poses)
+        self._eye: tuple[int, int, int] | None = None
+        self._first_look(self.overview(poses))
         scene.set_up_direction(tuple(self._up))
         self._server.initial_camera.up = tuple(self._up)
-        self._server.initial_camera.position = tuple(position)
-        self._server.initial_camera.look_at = tuple(centre)
         self._clouds = {}
         scene.add_frame("/clouds", show_axes=False)
         self._closeup = Closeup(self._session, self._server)
@@ -106,6 +105,10 @@ class Scene:
         self._up, ahead = up_and_ahead(known if len(known) else np.eye(4)[None], self._subject.is_scanner)
         centre, radius = ball(np.concatenate([known[:, :3, 3], _sampled(clouds, poses)]))
         return centre + max(radius, self._size) * (1.8 * self._up - 1.3 * ahead), centre
+
+    def _first_look(self, view: tuple[Floats, Floats]) -> None:
+        """Where a page that comes sees from, and what it looks at."""
+        self._server.initial_camera.position, self._server.initial_camera.look_at = map(tuple, view)
 
     def draw(self, flip: bool = False) -> None:
         """Bring the scene up to date with the session; what has not changed is not sent again."""
@@ -176,24 +179,34 @@ class Scene:
     def _turn_to(self, pair: Shown | None, home: int) -> None:
         """Let every page look at the pair; at what it saw before when that is left; at all when `home` grew.
 
-        A page that has just come, or come back after its connection broke, sees all until it is told otherwise.
+        A page that comes, or comes back after its connection broke, begins with it: until it has set itself up it
+        may lose what it is told.
         """
         eye = (-1, -1, home) if pair is None else (pair.i, pair.j, int(pair.wants_points))
+        if eye != self._eye:
+            self._eye, self._view = eye, self._view_of(pair)
+            self._first_look(self._view)
         for number, client in self._server.get_clients().items():
-            before, self._eyes[number] = self._eyes.get(number, (-1, -1, home)), eye
+            is_known, before = number in self._eyes, self._eyes.get(number, (-1, -1, home))
+            self._eyes[number] = eye
             if before == eye:
                 continue
-            if pair is not None:
+            if pair is not None and is_known:
                 self._looked.setdefault(number, (client.camera.position, client.camera.look_at))
-                back = pair.world_from_i[:3, 3] - pair.middle
-                way = back + 0.8 * np.linalg.norm(back) * self._up
-                client.camera.position = pair.middle + 2.2 * pair.size_m * way / max(float(np.linalg.norm(way)), 1e-9)
-                client.camera.look_at = pair.middle
-            elif number in self._looked:
+            if pair is None and number in self._looked:
                 client.camera.position, client.camera.look_at = self._looked.pop(number)
-            else:
-                position, centre = self.overview(self._session.settled.world_from_cam)
-                client.camera.up_direction, client.camera.position, client.camera.look_at = self._up, position, centre
+                continue
+            if pair is None:
+                client.camera.up_direction = self._up
+            client.camera.position, client.camera.look_at = self._view
+
+    def _view_of(self, pair: Shown | None) -> tuple[Floats, Floats]:
+        """Where the pair, or all, is seen from, and its middle."""
+        if pair is None:
+            return self.overview(self._session.settled.world_from_cam)
+        back = pair.world_from_i[:3, 3] - pair.middle
+        way = back + 0.8 * np.linalg.norm(back) * self._up
+        return pair.middle + 2.2 * pair.size_m * way / max(float(np.linalg.norm(way)), 1e-9), pair.middle
 
     def _same(self, name: str, *drawn: Any) -> bool:
         """Whether this was drawn with the same numbers before; else they are remembered."""
