@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_pipeline import se3
 from hodge_pipeline.complex.closing import cycle_errors
-from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.cycles import fundamental_loops, fundamental_products, spanning_forest
+from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.cycles import WITNESSES, Cycles
 from hodge_pipeline.diagnosis.options import WRONG_BELOW
@@ -22,6 +21,7 @@ from hodge_pipeline.diagnosis.result import (
     Diagnosis,
 )
 from hodge_pipeline.diagnosis.wording import distance
+from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.trust import Backbone
 from hodge_pipeline.solvers.resistance import Network, effective_resistance
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
@@ -71,18 +71,31 @@ def _cycles(graph: ViewGraph, backbone: Backbone, in_loop: Bools) -> tuple[Cycle
     """The cycle of each loop with the steps that it spans, and the row of each edge's (E,): of the shortest loops, and
     of those whose steps confirmed loops pass over, since no step is to blame for a loop that fails alone.
     """
-    chain, steps = backbone.chain, np.flatnonzero(backbone.steps & in_loop)
-    forest = spanning_forest(graph.edges[steps], graph.vertex_count)
-    forest = replace(forest, edges=graph.edges, parent_edge=np.append(steps, -1)[forest.parent_edge])
-    component = connected_components(graph.edges[steps], graph.vertex_count)[graph.edges[chain.loop_edge]]
-    same, spans = component[:, 0] == component[:, 1], np.diff(chain.ends, axis=1)[:, 0]
-    order = np.flatnonzero(same)[np.argsort(spans[same], kind="stable")]
-    chords = chain.loop_edge[order[np.cumsum(spans[order] + 1) <= MOST_ENTRIES]]
-    loops = fundamental_loops(forest, chords)
-    errors = cycle_errors(loops, graph.i_from_j, fundamental_products(forest, graph.i_from_j, chords))
+    chain = backbone.chain
+    low, high = chain.ends.T
+    torn = np.cumsum(~np.append(in_loop, False)[chain.step_edge])
+    same = torn[low] == torn[high]
+    order = np.flatnonzero(same)[np.argsort((high - low)[same], kind="stable")]
+    order = order[np.cumsum((high - low)[order] + 1) <= MOST_ENTRIES]
+    low, high, chords = low[order], high[order], chain.loop_edge[order]
+    onward = graph.edges[chords, 0] == chain.order[low]
+    loops = _around(graph, chain, chords, low, high, onward)
+    begin, end = chain.poses[np.where(onward, low, high)], chain.poses[np.where(onward, high, low)]
+    errors = cycle_errors(loops, graph.i_from_j, graph.i_from_j[chords] @ se3.inverse(end) @ begin)
     row = np.full(graph.edge_count, -1, np.int64)
     row[chords] = np.arange(len(chords))
     return Cycles(loops, *errors, backbone.chi2[chords], backbone.used[chords]), row
+
+
+def _around(graph: ViewGraph, chain: Chain, chords: Ints, low: Ints, high: Ints, onward: Bools) -> Loops:
+    """Each of these loops (K,), from `low` to `high`, or back where it is not `onward`, and the steps that it spans."""
+    offsets = np.concatenate([[0], np.cumsum(high - low + 1)])
+    row = np.repeat(np.arange(len(chords)), high - low + 1)
+    nth = np.arange(len(row)) - offsets[row]
+    at = np.where(nth == 0, high[row], np.where(onward[row], high[row] - nth + 1, low[row] + nth))
+    step = chain.step_edge[at]
+    sign = np.where((graph.edges[step, 0] == chain.order[at - 1]) == onward[row], -1, 1)
+    return Loops(offsets, np.where(nth == 0, chords[row], step), np.where(nth == 0, 1, sign))
 
 
 def _reasons(backbone: Backbone, verdict: NDArray[np.str_], residual: tuple[Floats, Floats]) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.cycles import spanning_forest
 from hodge_pipeline.complex.judging import has_unit_information
+from hodge_pipeline.solvers.backbone import plane
 from hodge_pipeline.solvers.weights import PLANAR_AXES
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
@@ -53,6 +54,11 @@ class Chain:
         return len(self.order)
 
     @property
+    def is_spatial(self) -> bool:
+        """Whether motions leave the plane."""
+        return len(self.axes) == 6
+
+    @property
     def inner(self) -> Bools:
         """Positions (n,) that a step leads to."""
         return np.asarray((self.step_edge >= 0) | self.bridged)
@@ -91,8 +97,7 @@ class Chain:
 
     def adjoint(self, poses: Floats) -> Floats:
         """Ad (..., p, p) of the free axes."""
-        whole = se3.adjoint(poses)
-        return whole if len(self.axes) == 6 else np.asarray(whole[..., self.axes[:, None], self.axes])
+        return se3.adjoint(poses) if self.is_spatial else plane.adjoint(poses)
 
     def lever(self, origin: Floats) -> Floats:
         """The lower left block (K, 3, 3), (K, 2, 1) in the plane, of what takes twists to other origins (K, 3)."""
@@ -106,13 +111,11 @@ class Chain:
 
     def log(self, motions: Floats) -> Floats:
         """Twists (..., p) of the free axes."""
-        return np.asarray(se3.log(motions)[..., self.axes])
+        return se3.log(motions) if self.is_spatial else plane.log(motions)
 
     def exp(self, twists: Floats) -> Floats:
         """Motions (..., 4, 4) of twists (..., p)."""
-        xi = np.zeros((*twists.shape[:-1], 6))
-        xi[..., self.axes] = twists
-        return se3.exp(xi)
+        return se3.exp(twists) if self.is_spatial else plane.exp(twists)
 
 
 def sequential_edges(graph: ViewGraph) -> Bools:

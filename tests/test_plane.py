@@ -1,0 +1,23 @@
+"""Motions of the plane are what `se3` says of all motions."""
+
+import numpy as np
+import pytest
+
+from hodge_pipeline import se3
+from hodge_pipeline.solvers.backbone import plane
+from hodge_pipeline.solvers.weights import PLANAR_AXES
+
+ANGLES = (0.0, 1e-12, 1e-8, 9e-5, 1.1e-4, 1e-2, 1.0, 3.0, np.pi - 1e-9)
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (3,), (2, 3)])
+@pytest.mark.parametrize("angle", [*ANGLES, *(-angle for angle in ANGLES[1:])])
+def test_the_plane_is_part_of_space(angle: float, shape: tuple[int, ...]) -> None:
+    xi = np.concatenate([np.full((*shape, 1), angle), np.random.default_rng(0).normal(0, 50, (*shape, 2))], axis=-1)
+    whole = np.zeros((*shape, 6))
+    whole[..., PLANAR_AXES] = xi
+    motions = plane.exp(xi)
+    np.testing.assert_allclose(motions, se3.exp(whole), atol=1e-8)
+    np.testing.assert_allclose(plane.log(motions), xi, atol=1e-8)
+    adjoint = se3.adjoint(motions)[..., PLANAR_AXES[:, None], PLANAR_AXES]
+    np.testing.assert_allclose(plane.adjoint(motions), adjoint, atol=1e-12)
