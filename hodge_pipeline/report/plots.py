@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import LogFormatter
 
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.document import Picture
@@ -33,6 +33,14 @@ LEAST_DOT_M = 1e-3
 """Edges that fit better all have the first colour."""
 SMALLEST_RESIDUAL = 1e-3
 """Where a logarithmic histogram begins, in centimetres and degrees: nothing below it is of interest."""
+
+
+class PlainNumbers(LogFormatter):
+    """Writes 0.1 and 40 on a logarithmic axis, where Matplotlib has powers of ten."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        """The number at x; nothing where the ticks would be too many."""
+        return f"{x:g}" if super().__call__(x, pos) else ""
 
 
 def draw(report: Report) -> tuple[Picture, ...]:
@@ -112,7 +120,7 @@ def _score_histogram(figure: Figure, report: Report) -> None:
         axes.hist(scores, bins=bins, histtype="step", label=f"{name}{mean}", **_style(report, name))
     axes.set_xlabel(f"score, {counted_pairs(graph)}")
     _count(axes, "pairs")
-    axes.legend(frameon=False, fontsize=9, loc="best")
+    _legend_above(axes)
 
 
 def _residuals(figure: Figure, report: Report) -> None:
@@ -129,7 +137,12 @@ def _residuals(figure: Figure, report: Report) -> None:
         _log_histogram(axes, report, columns)
         axes.set_xlabel(name)
         _count(axes, "edges")
-        axes.legend(frameon=False, fontsize=8)
+        _legend_above(axes)
+
+
+def _legend_above(axes: Any) -> None:
+    """A legend that hides no bar."""
+    axes.legend(frameon=False, fontsize=8, loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0)
 
 
 def _small_unit(report: Report) -> tuple[str, float]:
@@ -147,7 +160,12 @@ def _log_histogram(axes: Any, report: Report, columns: list[tuple[str, Floats]])
         shown = values.clip(SMALLEST_RESIDUAL)
         axes.hist(shown, bins=bins, histtype="step", label=f"{name}{median}", **_style(report, name))
     axes.set_xscale("log")
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    _write_plainly(axes.xaxis)
+
+
+def _write_plainly(axis: Any) -> None:
+    axis.set_major_formatter(PlainNumbers())
+    axis.set_minor_formatter(PlainNumbers())
 
 
 def _count(axes: Any, what: str) -> None:
@@ -188,7 +206,7 @@ def _residual_dots(figure: Figure, axes: Any, report: Report, low: Ints, high: I
     dots = axes.scatter(
         low[order], high[order], s=size, c=sizes, cmap="cividis_r", norm=LogNorm(least, top), linewidths=0
     )
-    figure.colorbar(dots, ax=axes, label=f"residual, {unit}", shrink=0.8)
+    _write_plainly(figure.colorbar(dots, ax=axes, label=f"residual, {unit}", shrink=0.8).ax.yaxis)
 
 
 def _convergence(figure: Figure, report: Report) -> None:
@@ -212,4 +230,5 @@ def _convergence(figure: Figure, report: Report) -> None:
 def _log_where_positive(axes: Any, values: list[float]) -> None:
     if values and 0 < WIDE * min(values) < max(values):
         axes.set_yscale("log")
+        _write_plainly(axes.yaxis)
     axes.xaxis.get_major_locator().set_params(integer=True)
