@@ -272,32 +272,55 @@ class Fit:
         """The poses (n, 4, 4) after a move (R, p) of the loops' ends: runs bend by their covariance, what lies beyond
         the outermost ends follows them rigidly.
         """
-        reduced, linear = self.reduced, self.linear
-        (at, run), (begin, end), (first, second) = reduced.inside, reduced.ends[reduced.runs].T, reduced.runs.T
-        anchor, touched = reduced.anchor(linear.chain)
-        out = moves[anchor] - (linear.residual - linear.residual[reduced.ends[anchor]])
+        (first, second), (anchor, touched) = self.reduced.runs.T, self.reduced.anchor(self.linear.chain)
+        out = self._bent(moves[second] - moves[first]) + moves[anchor]
         out[~touched] = 0.0
-        gap = moves[second] - moves[first] + linear.residual[end] - linear.residual[begin]
+        return np.asarray(self.linear.chain.exp(out) @ self.linear.poses)
+
+    def between(self, ends: Floats) -> Floats:
+        """The poses (n, 4, 4) where the loops' ends have these (R, 4, 4), however far from theirs."""
+        linear, (first, second) = self.linear, self.reduced.runs.T
+        anchor, touched = self.reduced.anchor(linear.chain)
+        move = ends @ se3.inverse(linear.poses[self.reduced.ends])
+        out = self._bent(linear.chain.log(se3.inverse(move[first]) @ move[second]))
+        out[~touched] = 0.0
+        moved = linear.chain.exp(out) @ linear.poses
+        moved[touched] = move[anchor[touched]] @ moved[touched]
+        return np.asarray(moved)
+
+    def _bent(self, gap: Floats) -> Floats:
+        """How each position moves (n, p) beside the end that it follows, where the second end of each run moves so
+        (S, p) beside its first, about the world's origin.
+        """
+        reduced, linear = self.reduced, self.linear
+        (at, run), (begin, end) = reduced.inside, reduced.ends[reduced.runs].T
+        out = linear.residual[reduced.ends[reduced.anchor(linear.chain)[0]]] - linear.residual
+        gap = gap + linear.residual[end] - linear.residual[begin]
         pull = self.precision[: len(gap)] @ linear.shift(end) @ gap[..., None]
         bent = np.concatenate([np.zeros((1, gap.shape[1])), np.cumsum((self.steps @ pull[run])[..., 0], axis=0)])
         bent = bent[1:] - bent[reduced.first[run]]
         lever = linear.chain.lever(linear.poses[end, :3, 3])[run]
         bent[:, -lever.shape[1] :] -= np.einsum("kij,kj->ki", lever, bent[:, : lever.shape[2]])  # back to the origin
         out[at] += bent
-        return np.asarray(linear.chain.exp(out) @ linear.poses)
+        return out
 
 
 LEAST_WON, HALVINGS = 0.01, 4
 """Of χ²: a step that wins less moves nothing by more than a tenth of its standard deviation."""
+TORN, SHARE_WON = 10.0, 1e-4
+"""χ² to a number that loops state, from where on these contradict each other, and the share of it that a step must win
+then: no poses make them fit.
+"""
 
 
 def settled(fit: Fit, steps: int) -> Fit:
     """The fit at the poses of least cost with the active loops, or after as many steps: until one would win less of χ²
-    than `LEAST_WON`. A step that wins nothing is halved.
+    than `LEAST_WON`, or where they contradict each other a small share. A step that wins nothing is halved.
     """
+    torn = TORN * len(fit.reduced.active) * len(fit.linear.chain.axes)
     for _ in range(steps if len(fit.reduced.active) else 0):
         (moves, won), before = fit.moves(), fit.cost
-        if won < LEAST_WON:
+        if won < (LEAST_WON if before < torn else SHARE_WON * before):
             break
         for _ in range(HALVINGS):
             tried = replace(fit, linear=linearise(fit.linear.chain, fit.moved(moves)))
@@ -310,19 +333,21 @@ def settled(fit: Fit, steps: int) -> Fit:
     return fit
 
 
-def from_rotations(linear: Linear, rows: Ints, steps: int) -> Linear:
-    """The chain at poses that begin at its chordal rotations with these loops, which need no start, after as many
-    steps: loops that contradict each other may take hundreds.
+def from_rotations(bare: Fit, steps: int) -> Linear:
+    """The chain at poses that begin at the chordal rotations of the loops' ends, which need no start, after as many
+    steps: loops that contradict each other may take hundreds. `bare`: at the chain's own poses, where runs are edges.
     """
-    chain, at = linear.chain, np.flatnonzero(linear.chain.inner)
-    edges = np.concatenate([np.stack([at - 1, at], axis=1), chain.ends[rows]])
-    information = np.zeros((len(edges), 6, 6))
-    of_axes = inverse(np.concatenate([chain.step_covariance[at], chain.covariance[rows]]))
+    chain, reduced, poses = bare.linear.chain, bare.reduced, bare.linear.poses[bare.reduced.ends]
+    first, second = reduced.runs.T
+    back = se3.inverse(poses[second])
+    motion = np.concatenate([se3.inverse(poses[first]) @ poses[second], chain.motion[reduced.active]])
+    back[:, :3, 3] = 0.0  # the covariances of runs lie along the world's axes
+    of_axes = inverse(np.concatenate([chain.carried(back, bare.runs), chain.covariance[reduced.active]]))
+    information = np.zeros((len(motion), 6, 6))
     information[:, chain.axes[:, None], chain.axes] = of_axes
-    motion = np.concatenate([chain.step[at], chain.motion[rows]])
-    graph = ViewGraph.from_edges(np.arange(chain.size), edges, motion, information)
-    found = solve(graph, start=linear.poses, dimension=2 if len(chain.axes) == 3 else 3, max_iterations=steps)
-    return linearise(chain, found.world_from_cam)
+    graph = ViewGraph.from_edges(np.arange(len(poses)), reduced.network.edges, motion, information)
+    found = solve(graph, start=poses, dimension=3 if chain.is_spatial else 2, max_iterations=steps)
+    return linearise(chain, bare.between(found.world_from_cam))
 
 
 LEAST_LEFT = 1e-6

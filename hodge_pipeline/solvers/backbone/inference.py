@@ -164,7 +164,7 @@ def _agreed(
         fit = settled(Fit(reduced, linear), MOST_STEPS)
         if number == SETTLING and fit.cost > len(reduced.active) * len(chain.axes):
             # more than right loops should leave: the descent may have ended in a valley beside
-            other = settled(Fit(reduced, from_rotations(linear, reduced.active, MOST_STEPS)), MOST_STEPS)
+            other = settled(Fit(reduced, from_rotations(Fit(reduced, start), MOST_STEPS)), MOST_STEPS)
             fit = min(fit, other, key=_cost)
         linear = fit.linear
         judged = judge(linear, fit, shares, wrong)
