@@ -17,7 +17,7 @@ from hodge_pipeline.solvers.backbone.chain import linear_forest, make_chain, seq
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, linearise, root, settled
 from hodge_pipeline.solvers.backbone.judge import left_out
 from hodge_pipeline.solvers.backbone.sparse import Network
-from hodge_pipeline.solvers.backbone.trust import find_backbone
+from hodge_pipeline.solvers.backbone.trust import find_backbone, of_every_loop
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import ViewGraph
 from tests.backbone_graphs import Drive, drive, round_trip
@@ -202,6 +202,23 @@ def test_loops_that_are_stated_to_be_exact_refute_no_others(data_dir: Path) -> N
     assert graph is not None
     backbone = find_backbone(graph)
     assert backbone is not None and backbone.used.all()
+
+
+def test_loops_that_are_judged_by_some_are_all_solved_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = drive(seed=3, count=900, world="town", wrong=0.3, loops=300)
+    monkeypatch.setattr(fit, "MOST_ACTIVE", 8)
+    backbone = find_backbone(made.graph)
+    assert backbone is not None and len(backbone.found.reduced.active) <= 8
+    assert not backbone.used[~made.right].any()
+    some_m = made.error_m(backbone.found.poses[np.argsort(backbone.chain.order)])
+    assert made.error_m(backbone.world_from_cam) < 0.7 * some_m
+
+    wrong = np.flatnonzero(~made.right)[:3]
+    used = backbone.used.copy()
+    used[wrong] = True
+    found = of_every_loop(made.graph, replace(backbone, used=used))
+    assert not found.used[wrong].any() and (found.right[wrong] < 0.5).all()
+    np.testing.assert_array_equal(found.used, backbone.used)
 
 
 @pytest.mark.parametrize(("world", "count", "loops", "group"), [("ring", 150, 90, 12), ("town", 250, 150, 60)])

@@ -101,7 +101,7 @@ def _around(graph: ViewGraph, chain: Chain, chords: Ints, low: Ints, high: Ints,
 def _reasons(backbone: Backbone, verdict: NDArray[np.str_], residual: tuple[Floats, Floats]) -> tuple[str, ...]:
     """One line for each edge: who confirms it, and how far it is from the poses."""
     over = _passed_over(backbone)
-    others = int(backbone.found.used.sum())
+    others = int(backbone.loops_used.sum())
     lines = []
     for edge, name in enumerate(verdict.tolist()):
         if backbone.steps[edge] and name != WRONG:
@@ -126,7 +126,7 @@ def _reasons(backbone: Backbone, verdict: NDArray[np.str_], residual: tuple[Floa
 def _passed_over(backbone: Backbone) -> Ints:
     """How many used loops (E,) pass over each step."""
     chain, out = backbone.chain, np.zeros(len(backbone.steps), np.int64)
-    ends = chain.ends[backbone.found.used & (chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]])]
+    ends = chain.ends[backbone.loops_used & (chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]])]
     steps = np.flatnonzero(chain.step_edge >= 0)
     out[chain.step_edge[steps]] = chain.over(ends)[steps]
     return out
