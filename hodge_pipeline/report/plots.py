@@ -184,12 +184,12 @@ def _matrix(figure: Figure, report: Report) -> None:
         marker = MARKERS[rank % len(MARKERS)]
         axes.scatter(high[rows], low[rows], s=size, color=colour, marker=marker, linewidths=0, label=str(name))
     _residual_dots(figure, axes, report, low, high, size)
-    axes.legend(
+    figure.legend(
+        *axes.get_legend_handles_labels(),
         frameon=False,
         fontsize=8,
         markerscale=(16 / size) ** 0.5,
-        loc="upper center",
-        bbox_to_anchor=(0.5, 1.14),
+        loc="outside upper center",
         ncols=3,
     )
 
