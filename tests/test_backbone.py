@@ -216,9 +216,10 @@ def test_loops_that_are_judged_by_some_are_all_solved_for(monkeypatch: pytest.Mo
     wrong = np.flatnonzero(~made.right)[:3]
     used = backbone.used.copy()
     used[wrong] = True
-    found = of_every_loop(made.graph, replace(backbone, used=used))
+    found = of_every_loop(made.graph, replace(backbone, used=used), backbone.steps)
     assert not found.used[wrong].any() and (found.right[wrong] < 0.5).all()
     np.testing.assert_array_equal(found.used, backbone.used)
+    assert of_every_loop(made.graph, replace(backbone, used=used), used).used[wrong].all()
 
 
 @pytest.mark.parametrize(("world", "count", "loops", "group"), [("ring", 150, 90, 12), ("town", 250, 150, 60)])

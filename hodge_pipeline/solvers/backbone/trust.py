@@ -140,7 +140,11 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
     agree = agreeing_loops(found.scales.applied(chain), ~found.used) if doubted else 0
     doubted = doubted and bool(broken or agree > AGREEING * steps.sum())
     backbone = _backbone(graph, chain, found, steps, doubted)
-    return backbone if anyway or len(found.reduced.active) >= found.used.sum() else of_every_loop(graph, backbone)
+    if anyway or len(found.reduced.active) >= found.used.sum():
+        return backbone
+    trusted = steps.copy()
+    trusted[chain.loop_edge] = always
+    return of_every_loop(graph, backbone, trusted)
 
 
 def _of_source(graph: ViewGraph, source: str) -> Bools:
@@ -163,9 +167,10 @@ def _backbone(graph: ViewGraph, chain: Chain, found: Inferred, steps: Bools, dou
     return Backbone(chain, found, steps, used, right, chi2, poses, doubted)
 
 
-def of_every_loop(graph: ViewGraph, backbone: Backbone) -> Backbone:
+def of_every_loop(graph: ViewGraph, backbone: Backbone, trusted: Bools) -> Backbone:
     """The backbone at the poses of all loops that count, where they were judged by some of them, with heavy tails where
-    one is off; a loop that is farther off than one right loop among so many should be counts no more.
+    one is off; a loop that is farther off than one right loop among so many should be counts no more, unless it is
+    among the `trusted (E,)` edges.
     """
     size, rows, weighted = len(backbone.chain.axes), np.flatnonzero(backbone.used), backbone.weighted(graph)
     gate = size * float(fdtri(size, FREEDOM, 1 - 1 / backbone.loops_used.sum()))
@@ -173,7 +178,7 @@ def of_every_loop(graph: ViewGraph, backbone: Backbone) -> Backbone:
     for _ in range(MOST_SOLVED):
         heavy_tailed = replace(weighted, information=weighted.information * weight[:, None, None])
         poses = solve(heavy_tailed, start=poses, initial="given", relative_tolerance=TOLERANCE).world_from_cam
-        chi2 = np.where(backbone.steps[rows], 0.0, chi2_by_information(weighted, poses))
+        chi2 = np.where(trusted[rows], 0.0, chi2_by_information(weighted, poses))
         before, off = off, chi2 > gate
         if (off == before).all():
             break
