@@ -8,7 +8,7 @@ import pytest
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.diagnosis.options import WRONG_BELOW, DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
 from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.solvers.backbone import fit
@@ -217,7 +217,7 @@ def test_loops_that_are_judged_by_some_are_all_solved_for(monkeypatch: pytest.Mo
     used = backbone.used.copy()
     used[wrong] = True
     found = of_every_loop(made.graph, replace(backbone, used=used), backbone.steps)
-    assert not found.used[wrong].any() and (found.right[wrong] < 0.5).all()
+    assert not found.used[wrong].any() and (found.right[wrong] < WRONG_BELOW).all()
     np.testing.assert_array_equal(found.used, backbone.used)
     assert of_every_loop(made.graph, replace(backbone, used=used), used).used[wrong].all()
 

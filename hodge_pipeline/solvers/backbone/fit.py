@@ -273,7 +273,7 @@ class Fit:
         the outermost ends follows them rigidly.
         """
         (first, second), (anchor, touched) = self.reduced.runs.T, self.reduced.anchor(self.linear.chain)
-        out = self._bent(moves[second] - moves[first]) + moves[anchor]
+        out = self._bent(anchor, moves[second] - moves[first]) + moves[anchor]
         out[~touched] = 0.0
         return np.asarray(self.linear.chain.exp(out) @ self.linear.poses)
 
@@ -282,19 +282,19 @@ class Fit:
         linear, (first, second) = self.linear, self.reduced.runs.T
         anchor, touched = self.reduced.anchor(linear.chain)
         move = ends @ se3.inverse(linear.poses[self.reduced.ends])
-        out = self._bent(linear.chain.log(se3.inverse(move[first]) @ move[second]))
+        out = self._bent(anchor, linear.chain.log(se3.inverse(move[first]) @ move[second]))
         out[~touched] = 0.0
         moved = linear.chain.exp(out) @ linear.poses
         moved[touched] = move[anchor[touched]] @ moved[touched]
         return np.asarray(moved)
 
-    def _bent(self, gap: Floats) -> Floats:
-        """How each position moves (n, p) beside the end that it follows, where the second end of each run moves so
-        (S, p) beside its first, about the world's origin.
+    def _bent(self, anchor: Ints, gap: Floats) -> Floats:
+        """How each position moves (n, p) beside its `anchor (n,)`, the end that it follows, where the second end of
+        each run moves so (S, p) beside its first, about the world's origin.
         """
         reduced, linear = self.reduced, self.linear
         (at, run), (begin, end) = reduced.inside, reduced.ends[reduced.runs].T
-        out = linear.residual[reduced.ends[reduced.anchor(linear.chain)[0]]] - linear.residual
+        out = linear.residual[reduced.ends[anchor]] - linear.residual
         gap = gap + linear.residual[end] - linear.residual[begin]
         pull = self.precision[: len(gap)] @ linear.shift(end) @ gap[..., None]
         bent = np.concatenate([np.zeros((1, gap.shape[1])), np.cumsum((self.steps @ pull[run])[..., 0], axis=0)])

@@ -173,7 +173,8 @@ def of_every_loop(graph: ViewGraph, backbone: Backbone, trusted: Bools) -> Backb
     among the `trusted (E,)` edges.
     """
     size, rows, weighted = len(backbone.chain.axes), np.flatnonzero(backbone.used), backbone.weighted(graph)
-    gate = size * float(fdtri(size, FREEDOM, 1 - 1 / backbone.loops_used.sum()))
+    rare = 1 / backbone.loops_used.sum()
+    gate = size * float(fdtri(size, FREEDOM, 1 - rare))
     poses, weight, off = backbone.world_from_cam, np.ones(len(rows)), np.zeros(len(rows), bool)
     for _ in range(MOST_SOLVED):
         heavy_tailed = replace(weighted, information=weighted.information * weight[:, None, None])
@@ -184,7 +185,7 @@ def of_every_loop(graph: ViewGraph, backbone: Backbone, trusted: Bools) -> Backb
             break
         weight = np.minimum((FREEDOM + size) / (FREEDOM + chi2), 1.0)
     used, right = backbone.used.copy(), backbone.right.copy()
-    used[rows[off]], right[rows[off]] = False, np.minimum(right[rows[off]], UNUSED)
+    used[rows[off]], right[rows[off]] = False, rare
     return replace(backbone, used=used, right=right, world_from_cam=poses)
 
 
