@@ -22,7 +22,7 @@ ARM_M = 1.0
 """Metres: a rotation counts as the displacement that it causes at this distance, about that of a room's walls."""
 
 LEAST_PRECISION, MOST_PRECISION = 1e-6, 1e6
-"""Of the median one, in units in which that is 1: eigenvalues of an information beyond are clipped."""
+"""Of each axis's median, in units in which that is 1: eigenvalues of an information beyond are clipped."""
 
 
 def hat(v: Floats) -> Floats:
@@ -113,9 +113,9 @@ def covariances(information: Floats) -> Floats:
     split = 1 if p == 3 else 3
     precision = np.einsum("eii->ei", information)
     unit = np.ones(p)
-    for part in (slice(0, split), slice(split, p)):
+    for part in (slice(0, split), slice(split, p), *(slice(axis, axis + 1) for axis in range(p))):
         positive = precision[:, part][precision[:, part] > 0]
-        unit[part] = 1 / np.sqrt(np.median(positive)) if len(positive) else 1.0
+        unit[part] = 1 / np.sqrt(np.median(positive)) if len(positive) else unit[part]
     scale = np.outer(unit, unit)
     values, vectors = np.linalg.eigh(0.5 * (information + np.swapaxes(information, 1, 2)) * scale)
     values = np.clip(values, LEAST_PRECISION, MOST_PRECISION)

@@ -78,3 +78,21 @@ def test_a_direction_that_few_steps_do_not_measure_is_as_stated() -> None:
 def test_information_of_a_radian_or_of_one_axis_that_is_known_far_better_is_believed(data_dir: Path, name: str) -> None:
     graph = read_graph(data_dir / f"pose_graphs/sesync/{name}.g2o").graph
     assert graph is not None and believed(graph, sequential_edges(graph))[1]
+
+
+@pytest.mark.parametrize("sigma", [1e-5, 1e-3])
+def test_a_plane_that_is_stated_in_space_is_judged_as_in_the_plane(sigma: float) -> None:
+    """Heights that always agree spoke for every wrong loop: 34 m where odometry has 9."""
+    made = drive(world="streets", wrong=0.8, loops=200, count=600)
+    information, out_of_plane = made.graph.information.copy(), [0, 1, 5]
+    information[:, out_of_plane, out_of_plane] = sigma**-2.0
+    found = diagnose(replace(made.graph, information=information, dimension=3))
+    np.testing.assert_array_equal(found.kept, made.right)
+    assert made.error_m(found.world_from_cam) <= 1.1 * made.error_m(diagnose(made.graph).world_from_cam)
+
+
+def test_an_axis_that_is_told_a_million_times_better_hides_no_other() -> None:
+    """A robot on a floor knows its roll to a microradian and its heading to a hundredth."""
+    spread = np.array([[1e-6, 1e-6, 1e-2, 0.1, 0.1, 1e-6]])
+    information = np.eye(6) / np.tile(spread, (4, 1))[:, None] ** 2
+    np.testing.assert_allclose(np.einsum("eii->ei", se3.covariances(information)), spread[[0] * 4] ** 2, rtol=1e-9)

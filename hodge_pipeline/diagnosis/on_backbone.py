@@ -129,4 +129,4 @@ def _passed_over(backbone: Backbone) -> Ints:
     ends = chain.ends[backbone.loops_used & (chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]])]
     steps = np.flatnonzero(chain.step_edge >= 0)
     out[chain.step_edge[steps]] = chain.over(ends)[steps]
-    return out
+    return np.asarray(out[backbone.alike])

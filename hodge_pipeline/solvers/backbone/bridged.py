@@ -27,6 +27,7 @@ from hodge_pipeline.solvers.backbone.inference import (
     infer,
     refused,
 )
+from hodge_pipeline.solvers.backbone.judge import by_path
 from hodge_pipeline.solvers.backbone.places import MOST_STEPS
 from hodge_pipeline.types import Bools
 
@@ -103,8 +104,9 @@ def joined(chain: Chain) -> Chain:
         poses = chain.poses
         wrong = Wrong.of(chain, poses)
         scaled = learn_scales(chain, poses, wrong)[0].applied(chain)
-        linear, none = linearise(scaled, poses), np.zeros(len(chain.ends))
-        told = Testimony(scaled, linear, none, wrong.log_density(scaled, poses), none > 0)
+        linear, rows, none = linearise(scaled, poses), np.arange(len(chain.ends)), np.zeros(len(chain.ends))
+        away = wrong.log_density(scaled, rows, linear.loops[0], by_path(linear, rows))
+        told = Testimony(scaled, linear, none, away, none > 0)
         pairs = chain.path[chain.ends]
         best, found = BY_CHANCE + float(np.log(len(pairs))), None
         for low, high in np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0).tolist():

@@ -118,15 +118,18 @@ class Chain:
         return se3.exp(twists) if self.is_spatial else plane.exp(twists)
 
 
-def sequential_edges(graph: ViewGraph) -> Bools:
-    """Edges (E,) between vertices that follow each other in the order of their ids; the first of parallel ones."""
+def consecutive_edges(graph: ViewGraph) -> Bools:
+    """Edges (E,) between vertices that follow each other in the order of their ids."""
     ranks = graph.edges
     if graph.vertex_ids.dtype.kind in "iu":
         ranks = np.argsort(np.argsort(graph.vertex_ids, kind="stable"), kind="stable")[ranks]
-    low = ranks.min(axis=1, initial=len(graph.vertex_ids))
-    out = np.zeros(graph.edge_count, bool)
-    consecutive = np.flatnonzero(np.abs(ranks[:, 0] - ranks[:, 1]) == 1)
-    out[consecutive[np.unique(low[consecutive], return_index=True)[1]]] = True
+    return np.asarray(np.abs(ranks[:, 0] - ranks[:, 1]) == 1)
+
+
+def sequential_edges(graph: ViewGraph) -> Bools:
+    """Consecutive edges (E,), the first of parallel ones."""
+    out, rows = np.zeros(graph.edge_count, bool), np.flatnonzero(consecutive_edges(graph))
+    out[rows[np.unique(np.sort(graph.edges[rows], axis=1), axis=0, return_index=True)[1]]] = True
     return out
 
 

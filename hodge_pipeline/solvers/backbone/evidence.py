@@ -17,8 +17,6 @@ from hodge_pipeline.types import Bools, Floats, Ints
 
 PAIRS, FEWEST_PAIRS = 4000, 200
 """Random pairs of positions that say how far apart places lie; of fewer, any two are taken instead."""
-LEAST_SPREAD = 1e-3
-"""Of the largest: the spread of places along an axis in which they hardly differ."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +24,12 @@ class Wrong:
     """The residual of a loop between two places at random: a Cauchy distribution of a shape (p, p) in axes that are
     parallel to the world's and begin at the loop's later end.
 
-    `precision (B, p, p)`, `log_scale (B,)`: for places that are so many steps apart, in octaves; the last of any two.
+    `spread (B, p)` and `axes (B, p, p)`, in columns: the eigenvalues and eigenvectors of the shape, for places that are
+    so many steps apart, in octaves; the last of any two.
     """
 
-    precision: Floats
-    log_scale: Floats
+    spread: Floats
+    axes: Floats
 
     @classmethod
     def of(cls, chain: Chain, poses: Floats) -> Wrong:
@@ -42,21 +41,22 @@ class Wrong:
             pairs[:, 1] = pairs[:, 0] + rng.integers(2**octave, 2 ** (octave + 1), PAIRS)
             near = pairs[_on_one_path(chain, pairs)]
             shapes.append(_shape(chain, poses, near, rng) if len(near) >= FEWEST_PAIRS else shapes[0])
-        shape = np.stack(shapes[::-1])
-        size = shape.shape[-1]
-        norm = gammaln((1 + size) / 2) - gammaln(0.5) - 0.5 * size * np.log(np.pi)
-        return cls(np.asarray(np.linalg.inv(shape), float), 0.5 * np.asarray(np.linalg.slogdet(shape)[1]) - norm)
+        return cls(*np.linalg.eigh(np.stack(shapes[::-1])))
 
-    def log_density(self, chain: Chain, poses: Floats) -> Floats:
-        """Of all loops (M,)."""
-        a, b = chain.ends.T
-        apart = chain.path[a] != chain.path[b]
-        octave = np.minimum(np.log2(np.maximum(b - a, 1)).astype(np.int64), len(self.precision) - 1)
-        octave[apart] = len(self.precision) - 1
-        residual = parallel(chain, chain.motion, poses[a], poses[b])
-        squares = np.einsum("mi,mij,mj->m", residual, self.precision[octave], residual)
-        squares[apart] = residual.shape[1]  # how two paths lie is not known
-        return np.asarray(-0.5 * (1 + residual.shape[1]) * np.log1p(squares) - self.log_scale[octave])
+    def log_density(self, chain: Chain, rows: Ints, residual: Floats, covariance: Floats) -> Floats:
+        """Of these loops (K,), with their residuals (K, p) and the covariances (K, p, p) that these have of right ones:
+        along an axis in which places hardly differ a wrong loop is as far off as a right one.
+        """
+        a, b = chain.ends[rows].T
+        apart, size = chain.path[a] != chain.path[b], residual.shape[1]
+        octave = np.minimum(np.log2(np.maximum(b - a, 1)).astype(np.int64), len(self.spread) - 1)
+        octave[apart] = len(self.spread) - 1
+        along = np.swapaxes(self.axes, 1, 2)[octave]
+        shape = np.maximum(self.spread[octave], ((along @ covariance) * along).sum(axis=2))
+        squares = ((along @ residual[:, :, None])[..., 0] ** 2 / shape).sum(axis=1)
+        squares[apart] = size  # how two paths lie is not known
+        norm = gammaln((1 + size) / 2) - gammaln(0.5) - 0.5 * size * np.log(np.pi)
+        return np.asarray(norm - 0.5 * np.log(shape).sum(axis=1) - 0.5 * (1 + size) * np.log1p(squares))
 
 
 def _on_one_path(chain: Chain, pairs: Ints) -> Bools:
@@ -71,7 +71,7 @@ def _shape(chain: Chain, poses: Floats, pairs: Ints, rng: np.random.Generator) -
     residual = parallel(chain, motion, poses[pairs[:, 0]], poses[pairs[:, 1]])
     moment, split = residual.T @ residual / max(len(residual), 1), turns(chain)
     shape = np.zeros_like(moment)
-    shape[:split, :split], shape[split:, split:] = _floored(moment[:split, :split]), _floored(moment[split:, split:])
+    shape[:split, :split], shape[split:, split:] = moment[:split, :split], moment[split:, split:]
     return shape
 
 
@@ -84,12 +84,6 @@ def parallel(chain: Chain, motion: Floats, from_a: Floats, from_b: Floats) -> Fl
     """Residuals (M, p) of motions between two poses, turned into the world's directions."""
     left = se3.log(se3.inverse(motion) @ se3.inverse(from_a) @ from_b).reshape(-1, 2, 3)
     return np.asarray(np.einsum("nij,nkj->nki", from_b[:, :3, :3], left).reshape(-1, 6)[:, chain.axes])
-
-
-def _floored(second_moment: Floats) -> Floats:
-    values, vectors = np.linalg.eigh(second_moment)
-    values = np.maximum(values, max(LEAST_SPREAD * float(values[-1]), 1e-12))
-    return np.asarray((vectors * values) @ vectors.T)
 
 
 def gaussian(residual: Floats, covariance: Floats) -> tuple[Floats, Floats]:
@@ -260,14 +254,15 @@ def _learned_from(path: Ints, loop: Ints, ends: Ints) -> tuple[Ints, Ints]:
 @dataclass(frozen=True)
 class _Model:
     """Residuals (M, p) of loops, with the covariances of their paths and their own as parts (3, M, p, p): of rotation,
-    of translation, and of both together; `away (M,)`: the log-density of wrong loops.
+    of translation, and of both together.
     """
 
+    chain: Chain
+    wrong: Wrong
     residual: Floats
     fixed: Floats
     path: Floats
     own: Floats
-    away: Floats
 
     @classmethod
     def of(cls, chain: Chain, poses: Floats, wrong: Wrong) -> _Model:
@@ -280,11 +275,13 @@ class _Model:
         fixed, path, own = path[0], path[1:] - path[0], own[1:]
         for parted in (path, own):
             parted[2] -= parted[0] + parted[1]
-        return cls(linear.loops[0], fixed, path, own, wrong.log_density(chain, poses))
+        return cls(chain, wrong, linear.loops[0], fixed, path, own)
 
     def select(self, rows: slice) -> _Model:
         """That of these loops."""
-        return _Model(self.residual[rows], self.fixed[rows], self.path[:, rows], self.own[:, rows], self.away[rows])
+        chosen = self.chain.with_loops(np.arange(len(self.residual))[rows], self.chain.ends[rows])
+        parts = self.residual[rows], self.fixed[rows], self.path[:, rows], self.own[:, rows]
+        return _Model(chosen, self.wrong, *parts)
 
     def value(self, logs: Floats) -> tuple[float, Floats]:
         """The log-likelihood of scales, against all loops being wrong, and the shares of right and wrong loops."""
@@ -292,7 +289,9 @@ class _Model:
             return 0.0, EVEN
         turn, shift, own_turn, own_shift = np.exp(logs)
         covariance = self.fixed + _weighed(self.path, turn, shift) + _weighed(self.own, own_turn, own_shift)
-        factor = student(self.residual, covariance)[0] - self.away
+        rows = np.arange(len(self.residual))
+        away = self.wrong.log_density(self.chain, rows, self.residual, covariance)
+        factor = student(self.residual, covariance)[0] - away
         shares, likelihood = mixture(np.stack([factor, np.zeros_like(factor)]))
         return likelihood, shares
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from hodge_pipeline.solvers.backbone.evidence import Wrong, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, root, without
-from hodge_pipeline.types import Floats
+from hodge_pipeline.types import Floats, Ints
 
 SAMPLES = 64
 
@@ -38,7 +38,8 @@ def judge(linear: Linear, fit: Fit | None, shares: Floats, wrong: Wrong, tense: 
     log_density = np.zeros((2, len(covariance)))
     chi2 = np.full(len(covariance), np.nan)
     log_density[0, known], chi2[known] = student(residual[known], covariance[known])
-    log_density[1, known] = wrong.log_density(linear.chain, linear.poses)[known]
+    at_hand = linear.loops[0][known]
+    log_density[1, known] = wrong.log_density(linear.chain, known, at_hand, covariance[known])
     factor = log_density[0] - log_density[1]
     return Judged(factor + np.log(shares[0] / shares[1]), factor, chi2, log_density)
 
@@ -62,6 +63,15 @@ def uncertainty(linear: Linear, fit: Fit | None) -> Floats:
         return out + own
     through = _between(fit)
     return np.asarray(np.where((_size(through) < _size(out))[:, None, None], through, out) + own)
+
+
+def by_path(linear: Linear, rows: Ints) -> Floats:
+    """The covariance (K, p, p) of the residuals of these loops by the path between their ends; their own between two
+    paths.
+    """
+    a, b = linear.chain.ends[rows].T
+    same = linear.chain.path[a] == linear.chain.path[b]
+    return linear.loops[1][rows] + np.where(same[:, None, None], linear.path(a, b), 0.0)
 
 
 def _size(covariance: Floats) -> Floats:

@@ -18,7 +18,7 @@ from hodge_pipeline.solvers.backbone.breaks import Testimony
 from hodge_pipeline.solvers.backbone.chain import loops_at_place, one_of_each_place
 from hodge_pipeline.solvers.backbone.evidence import EVEN, FREEDOM, Wrong, decoys, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, settled, thinned
-from hodge_pipeline.solvers.backbone.judge import Judged, judge, left_out
+from hodge_pipeline.solvers.backbone.judge import Judged, by_path, judge, left_out
 from hodge_pipeline.types import Bools, Floats, Ints
 
 MOST_STEPS = 15
@@ -153,8 +153,7 @@ class Places:
     def _away(self, fit: Fit) -> Floats:
         """The log-density (L,) of each active loop if it is wrong."""
         rows = fit.reduced.active
-        chain = self.start.chain.with_loops(rows, self.start.chain.ends[rows])
-        return self.wrong.log_density(chain, fit.linear.poses)
+        return self.wrong.log_density(self.start.chain, rows, fit.loops[0], by_path(self.start, rows))
 
     def best(self, linear: Linear, enough: float) -> tuple[Arrangement, bool]:
         """The likeliest arrangement, from that of all used places on, whose poses are near `linear`, and whether its

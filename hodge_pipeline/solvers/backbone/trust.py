@@ -13,6 +13,7 @@ from hodge_pipeline.solvers.backbone.bridged import MOST_BREAKS, infer_bridged
 from hodge_pipeline.solvers.backbone.chain import (
     Chain,
     believed,
+    consecutive_edges,
     linear_forest,
     make_chain,
     one_of_each_place,
@@ -20,10 +21,11 @@ from hodge_pipeline.solvers.backbone.chain import (
 )
 from hodge_pipeline.solvers.backbone.evidence import FREEDOM
 from hodge_pipeline.solvers.backbone.inference import Inferred
+from hodge_pipeline.solvers.backbone.parallel import Fused, fused
 from hodge_pipeline.solvers.backbone.polish import LOCAL
 from hodge_pipeline.solvers.backbone.step_tests import agreeing_loops, is_tested
 from hodge_pipeline.solvers.maximum_likelihood import solve
-from hodge_pipeline.types import Bools, Floats, ViewGraph
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 from hodge_pipeline.types.text import counted
 
 AUTO, SEQUENTIAL, NONE = "auto", "sequential", "none"
@@ -49,6 +51,7 @@ class Backbone:
 
     - `steps`, `used (E,)`: edges of the backbone, and all that count: a step that does not is broken; `right (E,)`:
       the probability of each loop, NaN for steps; `chi2 (E,)`: of each loop at the poses that the others lead to.
+    - `alike (E,)`: of an edge that states the same step again the row of the chain's, of all others their own.
     - `world_from_cam (V, 4, 4)`: each path begins at the identity where no loop ties it.
     - `doubted`: whether many loops agree with each other and not with the backbone, which may be what is wrong, or say
       that it is broken at several steps.
@@ -60,6 +63,7 @@ class Backbone:
     used: Bools
     right: Floats
     chi2: Floats
+    alike: Ints
     world_from_cam: Floats
     doubted: bool
 
@@ -68,7 +72,7 @@ class Backbone:
         graph, _ = believed(graph, self.steps)
         step, loop = self.found.scales.units(self.chain)
         width = np.ones((graph.edge_count, len(self.chain.axes)))
-        width[self.chain.step_edge[self.chain.step_edge >= 0]] = step * LOCAL
+        width[self.steps] = step * LOCAL
         width[self.chain.loop_edge] = loop * self.found.loop_width[:, None]
         whole = np.ones((graph.edge_count, 6))
         whole[:, self.chain.axes] = width
@@ -111,6 +115,14 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
     """
     if trust == NONE or not graph.edge_count:
         return None
+    again = consecutive_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
+    one = fused(graph, again)
+    backbone = _found(one.graph, trust, anyway)
+    return backbone and _of_all_edges(backbone, one)
+
+
+def _found(graph: ViewGraph, trust: str, anyway: bool) -> Backbone | None:
+    """The backbone of a graph that states each step once: see `find_backbone`."""
     chosen = sequential_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
     if trust == AUTO and chosen.sum() < max(FEWEST_STEPS, COVERED * graph.vertex_count):
         return None
@@ -164,7 +176,15 @@ def _backbone(graph: ViewGraph, chain: Chain, found: Inferred, steps: Bools, dou
     chi2[chain.loop_edge] = found.judged.chi2
     poses = np.empty((graph.vertex_count, 4, 4))
     poses[chain.order] = found.poses
-    return Backbone(chain, found, steps, used, right, chi2, poses, doubted)
+    return Backbone(chain, found, steps, used, right, chi2, np.arange(graph.edge_count), poses, doubted)
+
+
+def _of_all_edges(backbone: Backbone, one: Fused) -> Backbone:
+    """The backbone of the graph whose edges were fused."""
+    chain, rows = backbone.chain, np.append(one.rows, -1)
+    columns = {name: getattr(backbone, name)[one.alike] for name in ("steps", "used", "right", "chi2")}
+    chain = replace(chain, step_edge=rows[chain.step_edge], loop_edge=one.rows[chain.loop_edge])
+    return replace(backbone, chain=chain, alike=one.rows[one.alike], **columns)
 
 
 def of_every_loop(graph: ViewGraph, backbone: Backbone, trusted: Bools) -> Backbone:

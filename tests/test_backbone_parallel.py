@@ -1,0 +1,101 @@
+"""Steps that two sensors state: one backbone of their mean."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hodge_pipeline import se3
+from hodge_pipeline.complex.judging import has_unit_information
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.solvers.backbone.chain import consecutive_edges
+from hodge_pipeline.solvers.backbone.parallel import FEWEST, fused
+from hodge_pipeline.solvers.backbone.trust import find_backbone
+from hodge_pipeline.types import Floats, Ints, ViewGraph
+from tests.backbone_graphs import STEP, drive
+
+
+def with_second_odometry(graph: ViewGraph, seed: int = 0, times: float = 1.0) -> tuple[ViewGraph, Ints]:
+    """The graph and, behind its edges, each step once more, as exact but for a factor, half of them written the other
+    way round; and the rows of these steps.
+    """
+    rng, rows = np.random.default_rng(seed), np.flatnonzero(consecutive_edges(graph))
+    more, motions, edges = graph.select(rows), graph.i_from_j[rows], graph.edges[rows].copy()
+    noise = times * rng.normal(size=(len(rows), 6)) * np.repeat(STEP, 3)
+    if graph.dimension == 2:
+        noise[:, [0, 1, 5]] = 0.0
+    motions, back = motions @ se3.exp(noise), rng.random(len(rows)) < 0.5
+    edges[back], motions[back] = edges[back][:, ::-1], se3.inverse(motions[back])
+    information = more.information / times**2
+    information[back] = carried(se3.inverse(motions[back]), information[back])
+    return ViewGraph.joined([graph, replace(more, edges=edges, i_from_j=motions, information=information)]), rows
+
+
+def carried(motions: Floats, information: Floats) -> Floats:
+    back = se3.adjoint(se3.inverse(motions))
+    return np.asarray(np.swapaxes(back, 1, 2) @ information @ back)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("times", [1.0, 5.0])
+def test_two_odometries_are_one_backbone(dimension: int, times: float) -> None:
+    """Each step closed a cycle of two edges, so that no backbone was sought: 29 m where odometry has 4."""
+    made = drive(dimension=dimension, world="corridor", wrong=0.5, loops=60)
+    graph, rows = with_second_odometry(made.graph, times=times)
+    found = diagnose(graph)
+    np.testing.assert_array_equal(found.kept, np.concatenate([made.right, np.ones(len(rows), bool)]))
+    assert made.error_m(found.world_from_cam) < 0.5 * made.error_m(made.odometry())
+    why = list(found.reason)
+    assert why[made.graph.edge_count :] == [why[row] for row in rows]
+
+
+def test_the_mean_is_by_information_whichever_way_a_step_is_written() -> None:
+    made = drive(dimension=3, wrong=0.0, loops=10).graph
+    graph, rows = with_second_odometry(made, times=2.0)
+    one = fused(graph, consecutive_edges(graph))
+    assert one.graph.edge_count == made.edge_count
+    np.testing.assert_array_equal(one.rows[one.alike[made.edge_count :]], rows)
+    second = graph.select(np.arange(made.edge_count, graph.edge_count))
+    ahead = np.where((second.edges == made.edges[rows]).all(axis=1)[:, None, None], second.i_from_j, 0.0)
+    ahead += np.where((second.edges == made.edges[rows]).all(axis=1)[:, None, None], 0.0, se3.inverse(second.i_from_j))
+    apart = se3.log(se3.inverse(made.i_from_j[rows]) @ ahead)
+    moved = se3.log(se3.inverse(made.i_from_j[rows]) @ one.graph.i_from_j[rows])
+    np.testing.assert_allclose(moved, apart / 5, atol=1e-3)  # 1 to 1/4 of the information
+    np.testing.assert_allclose(one.graph.information[rows], 1.25 * made.information[rows], rtol=0.02, atol=1.0)
+
+
+def test_a_second_statement_that_differs_is_judged_by_itself() -> None:
+    made = drive(wrong=0.0, loops=60)
+    graph, rows = with_second_odometry(made.graph)
+    off = graph.i_from_j.copy()
+    row = made.graph.edge_count + 150
+    off[row] = off[row] @ se3.exp(np.array([0, 0, 0.5, 2.0, 0, 0]))
+    found = diagnose(replace(graph, i_from_j=off))
+    assert found.verdict[row] == "wrong" and found.kept.sum() == graph.edge_count - 1
+
+
+def test_information_that_is_unknown_stays_so() -> None:
+    made = drive(wrong=0.5, loops=60)
+    graph, _ = with_second_odometry(made.graph)
+    unknown = replace(graph, information=np.tile(np.eye(6), (graph.edge_count, 1, 1)))
+    assert has_unit_information(fused(unknown, consecutive_edges(unknown)).graph)
+    found = diagnose(unknown)
+    assert not (found.kept[: made.graph.edge_count] & ~made.right).any()
+    assert made.error_m(found.world_from_cam) < made.error_m(made.odometry())
+
+
+def test_few_parallel_edges_stay_as_they_are() -> None:
+    made = drive(wrong=0.0, loops=60).graph
+    graph, _ = with_second_odometry(made)
+    few = graph.select(np.arange(made.edge_count + FEWEST - 1))
+    assert fused(few, consecutive_edges(few)).graph is few
+
+
+def test_edges_of_another_source_are_not_trusted_with_the_one_that_is() -> None:
+    made = drive(wrong=0.0, loops=60).graph
+    graph, rows = with_second_odometry(made)
+    source = np.where(np.arange(graph.edge_count) < made.edge_count, "wheels", "scans")
+    backbone = find_backbone(replace(graph, source=source), "wheels")
+    assert backbone is not None and backbone.steps[rows].all() and not backbone.steps[made.edge_count :].any()
