@@ -210,7 +210,7 @@ def test_loops_that_are_judged_by_some_are_all_solved_for(monkeypatch: pytest.Mo
     backbone = find_backbone(made.graph)
     assert backbone is not None and len(backbone.found.reduced.active) <= 8
     assert not backbone.used[~made.right].any()
-    some_m = made.error_m(backbone.found.poses[np.argsort(backbone.chain.order)])
+    some_m = made.error_m(backbone.found.polished[0].poses[np.argsort(backbone.chain.order)])
     assert made.error_m(backbone.world_from_cam) < 0.7 * some_m
 
     wrong = np.flatnonzero(~made.right)[:3]

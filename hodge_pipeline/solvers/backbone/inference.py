@@ -38,18 +38,11 @@ class Inferred:
     confirmed: bool
 
     @cached_property
-    def _polished(self) -> tuple[Linear, Floats]:
+    def polished(self) -> tuple[Linear, Floats]:
+        """The chain at the poses of the used loops, and factors (M,) on the loops' standard deviations for the last
+        solve.
+        """
         return polished(self.reduced, self.linear)
-
-    @property
-    def poses(self) -> Floats:
-        """World from each position (n, 4, 4) by the used loops."""
-        return self._polished[0].poses
-
-    @property
-    def loop_width(self) -> Floats:
-        """Factors (M,) on the loops' standard deviations for the last solve."""
-        return self._polished[1]
 
 
 def infer(

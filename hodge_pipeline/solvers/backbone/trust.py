@@ -20,6 +20,7 @@ from hodge_pipeline.solvers.backbone.chain import (
     sequential_edges,
 )
 from hodge_pipeline.solvers.backbone.evidence import FREEDOM
+from hodge_pipeline.solvers.backbone.fit import Linear
 from hodge_pipeline.solvers.backbone.inference import Inferred
 from hodge_pipeline.solvers.backbone.parallel import Fused, fused
 from hodge_pipeline.solvers.backbone.polish import LOCAL
@@ -51,6 +52,7 @@ class Backbone:
 
     - `steps`, `used (E,)`: edges of the backbone, and all that count: a step that does not is broken; `right (E,)`:
       the probability of each loop, NaN for steps; `chi2 (E,)`: of each loop at the poses that the others lead to.
+    - `loop_width (M,)`: factors on the standard deviations of the chain's loops for the last solve.
     - `alike (E,)`: of an edge that states the same step again the row of the chain's, of all others their own.
     - `world_from_cam (V, 4, 4)`: each path begins at the identity where no loop ties it.
     - `doubted`: whether many loops agree with each other and not with the backbone, which may be what is wrong, or say
@@ -63,6 +65,7 @@ class Backbone:
     used: Bools
     right: Floats
     chi2: Floats
+    loop_width: Floats
     alike: Ints
     world_from_cam: Floats
     doubted: bool
@@ -73,7 +76,7 @@ class Backbone:
         step, loop = self.found.scales.units(self.chain)
         width = np.ones((graph.edge_count, len(self.chain.axes)))
         width[self.steps] = step * LOCAL
-        width[self.chain.loop_edge] = loop * self.found.loop_width[:, None]
+        width[self.chain.loop_edge] = loop * self.loop_width[:, None]
         whole = np.ones((graph.edge_count, 6))
         whole[:, self.chain.axes] = width
         information = graph.information / (whole[:, :, None] * whole[:, None, :])
@@ -151,12 +154,12 @@ def _found(graph: ViewGraph, trust: str, anyway: bool) -> Backbone | None:
     doubted = trust == AUTO and many_loops
     agree = agreeing_loops(found.scales.applied(chain), ~found.used) if doubted else 0
     doubted = doubted and bool(broken or agree > AGREEING * steps.sum())
-    backbone = _backbone(graph, chain, found, steps, doubted)
     if anyway or len(found.reduced.active) >= found.used.sum():
-        return backbone
+        return _backbone(graph, chain, found, found.polished, steps, doubted)
     trusted = steps.copy()
     trusted[chain.loop_edge] = always
-    return of_every_loop(graph, backbone, trusted)
+    as_judged = found.linear, np.ones(len(found.used))
+    return of_every_loop(graph, _backbone(graph, chain, found, as_judged, steps, doubted), trusted)
 
 
 def _of_source(graph: ViewGraph, source: str) -> Bools:
@@ -167,7 +170,9 @@ def _of_source(graph: ViewGraph, source: str) -> Bools:
     return chosen
 
 
-def _backbone(graph: ViewGraph, chain: Chain, found: Inferred, steps: Bools, doubted: bool) -> Backbone:
+def _backbone(
+    graph: ViewGraph, chain: Chain, found: Inferred, solved: tuple[Linear, Floats], steps: Bools, doubted: bool
+) -> Backbone:
     used, right, chi2 = steps.copy(), np.full(graph.edge_count, np.nan), np.full(graph.edge_count, np.nan)
     used[chain.loop_edge] = found.used
     used[chain.step_edge[chain.bridged & (chain.step_edge >= 0)]] = False
@@ -175,8 +180,8 @@ def _backbone(graph: ViewGraph, chain: Chain, found: Inferred, steps: Bools, dou
     right[chain.loop_edge] = np.where(found.used, probability, np.minimum(probability, UNUSED))
     chi2[chain.loop_edge] = found.judged.chi2
     poses = np.empty((graph.vertex_count, 4, 4))
-    poses[chain.order] = found.poses
-    return Backbone(chain, found, steps, used, right, chi2, np.arange(graph.edge_count), poses, doubted)
+    poses[chain.order] = solved[0].poses
+    return Backbone(chain, found, steps, used, right, chi2, solved[1], np.arange(graph.edge_count), poses, doubted)
 
 
 def _of_all_edges(backbone: Backbone, one: Fused) -> Backbone:
