@@ -55,10 +55,8 @@ def left_out(fit: Fit) -> tuple[Floats, Floats]:
 
 def uncertainty(linear: Linear, fit: Fit | None) -> Floats:
     """The covariance (M, p, p) of each loop's residual at the poses of a fit; infinite where nothing tells."""
-    chain, own = linear.chain, linear.loops[1]
-    a, b = chain.ends.T
-    same = chain.path[a] == chain.path[b]
-    out = np.where(same[:, None, None], linear.path(a, b), np.inf)
+    own = linear.loops[1]
+    out = _along(linear, np.arange(len(own)), np.inf)
     if fit is None or not len(fit.reduced.active):
         return out + own
     through = _between(fit)
@@ -69,9 +67,14 @@ def by_path(linear: Linear, rows: Ints) -> Floats:
     """The covariance (K, p, p) of the residuals of these loops by the path between their ends; their own between two
     paths.
     """
+    return linear.loops[1][rows] + _along(linear, rows, 0.0)
+
+
+def _along(linear: Linear, rows: Ints, between: float) -> Floats:
+    """The covariance (K, p, p) of the path between the ends of these loops, `between` two paths this number."""
     a, b = linear.chain.ends[rows].T
     same = linear.chain.path[a] == linear.chain.path[b]
-    return linear.loops[1][rows] + np.where(same[:, None, None], linear.path(a, b), 0.0)
+    return np.where(same[:, None, None], linear.path(a, b), between)
 
 
 def _size(covariance: Floats) -> Floats:

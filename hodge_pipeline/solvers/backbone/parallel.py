@@ -8,10 +8,10 @@ import numpy as np
 from scipy.special import fdtri
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.judging import has_unit_information
+from hodge_pipeline.complex.judging import has_unit_information, in_vertex_order
 from hodge_pipeline.solvers.backbone.chain import free_axes
 from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian
-from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+from hodge_pipeline.types import Bools, Ints, ViewGraph
 
 FEWEST = 10
 """Steps that are stated again, from where on what they differ by tells how much is usual."""
@@ -33,23 +33,20 @@ def fused(graph: ViewGraph, again: Bools) -> Fused:
     """The graph with the mean, by information, in place of parallel edges among those that may state a step `again
     (E,)`; one that differs from the first by more than one right edge among so many should stays an edge of its own.
     """
-    edges, whole = graph.edges, np.arange(graph.edge_count)
-    rows = np.flatnonzero(again & (edges[:, 0] != edges[:, 1]))
-    keys = edges[rows].min(axis=1) * graph.vertex_count + edges[rows].max(axis=1)
-    _, begin, group = np.unique(keys, return_index=True, return_inverse=True)
+    whole, (i, j) = np.arange(graph.edge_count), np.sort(graph.edges, axis=1).T
+    rows = np.flatnonzero(again & (i != j))
+    _, begin, group = np.unique((i * graph.vertex_count + j)[rows], return_index=True, return_inverse=True)
     first = rows[begin][group]
     second, first = rows[first != rows], first[first != rows]
     if len(second) < FEWEST:
         return Fused(graph, whole, whole)
-    axes, unknown = free_axes(graph), has_unit_information(graph)
-    motion, information = _turned(graph, second, edges[second, 0] != edges[first, 0])
-    apart = se3.log(se3.inverse(graph.i_from_j[first]) @ motion)
-    pairs = np.concatenate([graph.information[first], information])[:, axes[:, None], axes]
-    own, other = np.split(se3.covariances(pairs), 2)
-    chi2 = gaussian(apart[:, axes], own + other)[1]
+    axes, unknown, graph = free_axes(graph), has_unit_information(graph), in_vertex_order(graph)[0]
+    apart = se3.log(se3.inverse(graph.i_from_j[first]) @ graph.i_from_j[second])
+    both = se3.covariances(graph.information[np.concatenate([first, second])][:, axes[:, None], axes])
+    chi2 = gaussian(apart[:, axes], both[: len(first)] + both[len(first) :])[1]
     usual = max(float(np.median(chi2)) / len(axes), 0.0 if unknown else 1.0)
     agree = chi2 <= usual * len(axes) * float(fdtri(len(axes), FREEDOM, 1 - 1 / len(chi2)))
-    first, second, apart, information = first[agree], second[agree], apart[agree], information[agree]
+    first, second, apart, information = first[agree], second[agree], apart[agree], graph.information[second[agree]]
     total, pull = graph.information.copy(), np.zeros((graph.edge_count, 6))
     np.add.at(total, first, information)
     np.add.at(pull, first, np.einsum("nij,nj->ni", information, apart))
@@ -63,12 +60,3 @@ def fused(graph: ViewGraph, again: Bools) -> Fused:
     alike[second] = np.searchsorted(left, first)
     total = graph.information if unknown else total
     return Fused(replace(graph, i_from_j=motions, information=total).select(left), left, alike)
-
-
-def _turned(graph: ViewGraph, rows: Ints, reverse: Bools) -> tuple[Floats, Floats]:
-    """The motions (K, 4, 4) and information (K, 6, 6) of these edges, of some the inverse."""
-    motion, information = graph.i_from_j[rows], graph.information[rows]
-    back = se3.adjoint(se3.inverse(motion[reverse]))
-    information[reverse] = np.swapaxes(back, 1, 2) @ information[reverse] @ back
-    motion[reverse] = se3.inverse(motion[reverse])
-    return motion, information
