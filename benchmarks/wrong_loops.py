@@ -8,6 +8,7 @@
     python -m benchmarks.wrong_loops short --seed 1      # walks of 15 to 95 steps with few loops, some steps wrong
     python -m benchmarks.wrong_loops mistaken --seed 1   # walks with a loop a step, many of them mistaken in one way
     python -m benchmarks.wrong_loops lattices --seed 1   # cylinders and grids with 1 to 20 % of all edges wrong
+    python -m benchmarks.wrong_loops windows --seed 1    # walks with edges over two steps to ten: a sliding window
 
 Errors are metres RMS of positions after a rigid fit: to the truth, or for graphs of the literature to their own
 solution without the injected loops. WORSE: than 1.02 × the odometry. `--only WORD` takes the graphs whose name has
@@ -332,6 +333,31 @@ def lattice_cases(seed: int) -> Iterator[Case]:
                 yield Case(f"{kind} of {count}, {share:.0%} wrong", graph, place, ~bad)
 
 
+def window_cases(seed: int) -> Iterator[Case]:
+    """Walks of 600 steps each of whose frames is registered to several before it, with wrong loops, steps and edges."""
+    kinds = itertools.product(("ring", "corridor", "streets"), (2, 3, 10), (0.0, 0.5, 0.9, 1.0), (1, 5), (0.0, 0.03))
+    for number, (kind, reach, wrong, group, spoilt) in enumerate(kinds):
+        rng = np.random.default_rng([seed, number])
+        poses, bad, stated = walk(kind, 600, rng), round(100 * wrong), number % 4 < 3
+        name = f"{kind}, {reach} steps, {wrong:.0%} of loops wrong by {group}, {spoilt:.0%} of steps and edges, "
+        name += "stated" if stated else "unknown"
+        case = walked(name, poses, 100 - bad, bad, group, stated, rng)
+        graph, apart = case.graph, range(2, reach + 1)
+        pairs = np.concatenate([np.stack([np.arange(len(poses) - g), np.arange(g, len(poses))], axis=1) for g in apart])
+        spread = np.sqrt(np.diff(pairs, axis=1)) * NOISE
+        more = between(poses, pairs) @ se3.exp(rng.normal(size=spread.shape) * spread)
+        own = np.eye(6) / spread[:, None, :] ** 2 if stated else np.tile(np.eye(6), (len(pairs), 1, 1))
+        window = ViewGraph.from_edges(graph.vertex_ids, pairs, more, own)
+        graph = ViewGraph.joined([graph, window])
+        rows = np.flatnonzero(steps(graph) | (np.arange(graph.edge_count) >= case.graph.edge_count))
+        rows = rows[rng.random(len(rows)) < spoilt]
+        off, motions = rng.normal(size=(len(rows), 6)) * np.repeat([0.3, 1.5], 3), graph.i_from_j.copy()
+        motions[rows] = motions[rows] @ se3.exp(off)
+        right = np.concatenate([case.right, np.ones(len(pairs), bool)])
+        right[rows] = False
+        yield replace(case, graph=replace(graph, i_from_j=motions), right=right)
+
+
 KINDS = {
     "random": random_cases,
     "breaks": broken_cases,
@@ -341,6 +367,7 @@ KINDS = {
     "short": short_cases,
     "mistaken": mistaken_cases,
     "lattices": lattice_cases,
+    "windows": window_cases,
 }
 
 

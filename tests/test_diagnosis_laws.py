@@ -39,7 +39,7 @@ def test_right_edges_alone_are_never_blamed(seed: int) -> None:
 
 def test_one_wrong_edge_is_found_with_its_witnesses() -> None:
     graph, right = spoiled(measured(poses_on_a_ring(16), near_pairs(16, 3)), np.array([20]))
-    found = diagnose(graph, QUICK)
+    found = diagnose(graph, DiagnosisOptions(trust=NONE))
     assert found.verdict[20] == WRONG and (found.verdict[right] == CONSISTENT).all()
     (row, *_) = found.witnesses_against[20]
     assert row >= 0 and not found.cycles.closes[row]

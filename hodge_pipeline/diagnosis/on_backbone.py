@@ -40,9 +40,10 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone) -> Diagnosis:
     in_loop = np.zeros(graph.edge_count, bool)
     in_loop[np.flatnonzero(kept)] = series_classes(graph.edges[kept], graph.vertex_count) >= 0
     probability = np.where(backbone.steps, np.where(in_loop, RIGHT_STEP, np.nan), backbone.right)
-    probability[backbone.steps & ~kept] = 1 - RIGHT_STEP
+    refuted = backbone.steps & ~kept | backbone.contradicted
+    probability[refuted] = 1 - RIGHT_STEP
     untestable = np.isnan(probability)
-    wrong = ~kept & (probability < WRONG_BELOW) & (backbone.steps | backbone.found.confirmed)
+    wrong = ~kept & (probability < WRONG_BELOW) & (refuted | backbone.found.confirmed)
     verdict = np.select([untestable, wrong, kept], [UNTESTABLE, WRONG, CONSISTENT], SUSPECT)
     cycles, cycle = _cycles(graph, backbone, in_loop)
     network = Network.of(graph.edges[kept], graph.vertex_count)
@@ -50,7 +51,7 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone) -> Diagnosis:
         graph,
         verdict=verdict,
         probability=probability,
-        reasons=partial(_reasons, backbone, verdict),
+        reasons=partial(_reasons, graph.edges, backbone, verdict),
         kept=kept,
         network=network,
         resistance=effective_resistance(graph.edges, kept, network),
@@ -98,9 +99,11 @@ def _around(graph: ViewGraph, chain: Chain, chords: Ints, low: Ints, high: Ints,
     return Loops(offsets, np.where(nth == 0, chords[row], step), np.where(nth == 0, 1, sign))
 
 
-def _reasons(backbone: Backbone, verdict: NDArray[np.str_], residual: tuple[Floats, Floats]) -> tuple[str, ...]:
+def _reasons(
+    edges: Ints, backbone: Backbone, verdict: NDArray[np.str_], residual: tuple[Floats, Floats]
+) -> tuple[str, ...]:
     """One line for each edge: who confirms it, and how far it is from the poses."""
-    over = _passed_over(backbone)
+    over = _passed_over(edges, backbone)
     others = int(backbone.loops_used.sum())
     lines = []
     for edge, name in enumerate(verdict.tolist()):
@@ -109,7 +112,9 @@ def _reasons(backbone: Backbone, verdict: NDArray[np.str_], residual: tuple[Floa
             lines.append(f"an edge of the backbone: {passed}")
             continue
         away = distance(residual[0][edge], residual[1][edge])
-        if backbone.steps[edge]:
+        if backbone.contradicted[edge]:
+            lines.append(f"the other edges over the same steps contradict it: {away}")
+        elif backbone.steps[edge]:
             lines.append(f"an edge of the backbone that {over[edge]} confirmed loops over it contradict: {away}")
         elif backbone.used[edge]:
             lines.append(f"it agrees with the backbone and {others - 1} other loops: {away}")
@@ -123,10 +128,11 @@ def _reasons(backbone: Backbone, verdict: NDArray[np.str_], residual: tuple[Floa
     return tuple(lines)
 
 
-def _passed_over(backbone: Backbone) -> Ints:
+def _passed_over(edges: Ints, backbone: Backbone) -> Ints:
     """How many used loops (E,) pass over each step."""
     chain, out = backbone.chain, np.zeros(len(backbone.steps), np.int64)
     ends = chain.ends[backbone.loops_used & (chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]])]
-    steps = np.flatnonzero(chain.step_edge >= 0)
-    out[chain.step_edge[steps]] = chain.over(ends)[steps]
-    return np.asarray(out[backbone.alike])
+    over, steps = chain.over(ends), np.flatnonzero(chain.step_edge >= 0)
+    out[chain.step_edge[steps]] = over[steps]
+    out[backbone.part] = over[chain.spans(edges[backbone.part])[:, 1]]
+    return out

@@ -84,6 +84,12 @@ class Chain:
         along = np.clip((steps / own).mean(axis=1) / PLACE, 1 / longest, 1 / STEPS_OF_PLACE)
         return np.asarray(np.cumsum(along)[self.ends])
 
+    def spans(self, edges: Ints) -> Ints:
+        """The positions (K, 2) of two vertices each, the lower first."""
+        place = np.empty(self.size, np.int64)
+        place[self.order] = np.arange(self.size)
+        return np.sort(place[edges], axis=1)
+
     def over(self, ends: Ints, worth: Floats | None = None) -> Floats:
         """How many of the spans (K, 2) of positions, or how much of their `worth (K,)`, pass over each step (n,)."""
         low, high = ends.T

@@ -19,14 +19,16 @@ FEWEST = 10
 
 @dataclass(frozen=True)
 class Fused:
-    """A graph with one edge in place of those that state the same step and agree.
+    """A graph with one edge for each step, in place of all that speak of it and agree.
 
-    - `rows (E',)`: of its edges in the graph; `alike (E,)`: the edge that each edge of the graph is part of.
+    - `rows (E',)`: of its edges in the graph that was given; `part (N,)`: of edges there that are part of these;
+      `contradicted (K,)`: of those there that the others over the same steps speak against, in a step's place too.
     """
 
     graph: ViewGraph
     rows: Ints
-    alike: Ints
+    part: Ints
+    contradicted: Ints
 
 
 def fused(graph: ViewGraph, again: Bools) -> Fused:
@@ -39,7 +41,7 @@ def fused(graph: ViewGraph, again: Bools) -> Fused:
     first = rows[begin][group]
     second, first = rows[first != rows], first[first != rows]
     if len(second) < FEWEST:
-        return Fused(graph, whole, whole)
+        return Fused(graph, whole, whole[:0], whole[:0])
     axes, unknown, graph = free_axes(graph), has_unit_information(graph), in_vertex_order(graph)[0]
     apart = se3.log(se3.inverse(graph.i_from_j[first]) @ graph.i_from_j[second])
     both = se3.covariances(graph.information[np.concatenate([first, second])][:, axes[:, None], axes])
@@ -56,7 +58,5 @@ def fused(graph: ViewGraph, again: Bools) -> Fused:
     mean[:, axes] = np.einsum("nij,nj->ni", spread, pull[changed[:, None], axes])
     motions[changed] = motions[changed] @ se3.exp(mean)
     left = np.setdiff1d(whole, second)
-    alike = np.searchsorted(left, whole)
-    alike[second] = np.searchsorted(left, first)
     total = graph.information if unknown else total
-    return Fused(replace(graph, i_from_j=motions, information=total).select(left), left, alike)
+    return Fused(replace(graph, i_from_j=motions, information=total).select(left), left, second, whole[:0])

@@ -10,6 +10,8 @@ from hodge_pipeline.solvers.backbone.chain import Chain, linear_forest, make_cha
 from hodge_pipeline.solvers.backbone.evidence import gaussian
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
+LOOPS_AT_A_STEP = 0.5
+"""From there on loops may make a lattice, or a room, in which no edge needs to be trusted."""
 TESTED = 0.3
 """Of the steps in short cycles that close: from there on every edge is judged, none trusted at first. On graphs of
 rooms .77 to .98 are, on those of places visited again 0 to .1, and as many as there are edges over two steps or three.
@@ -26,9 +28,9 @@ def is_tested(chain: Chain) -> bool:
     """Whether cycles of one loop that close to less than a step test so many steps that none needs to be trusted."""
     (low, high), poses, tested = chain.ends.T, chain.poses, np.zeros(chain.size, bool)
     short = np.flatnonzero((chain.path[low] == chain.path[high]) & (high - low <= LONGEST))
-    closes = short[_closes(chain.motion[short], _between(poses, low[short], high[short]), _gate(chain))]
+    closing = short[closes(chain.motion[short], _between(poses, low[short], high[short]), gate(chain))]
     for ahead in range(1, LONGEST + 1):
-        over = closes[high[closes] - low[closes] >= ahead]
+        over = closing[high[closing] - low[closing] >= ahead]
         tested[low[over] + ahead] = True
     return bool(tested.sum() > TESTED * (chain.step_edge >= 0).sum())
 
@@ -58,7 +60,7 @@ def agreeing_loops(chain: Chain, among: Bools) -> int:
     """
     rows, poses = np.flatnonzero(among), chain.poses
     low, high = chain.ends[rows].T
-    keys, gate, out = low * chain.size + high, _gate(chain), np.zeros(len(rows), bool)
+    keys, limits, out = low * chain.size + high, gate(chain), np.zeros(len(rows), bool)
     order, path = np.argsort(keys, kind="stable"), chain.path
     for down, up in ((0, 1), (1, 0), (1, 1), (1, -1)) if len(keys) else ():
         moved = low + down, high + up
@@ -72,8 +74,8 @@ def agreeing_loops(chain: Chain, among: Bools) -> int:
         spread = spread + (chain.step_covariance[low[second]] if down else 0.0)
         spread = spread + (chain.step_covariance[high[first] + max(up, 0)] if up else 0.0)
         chi2 = gaussian(chain.log(se3.inverse(motion) @ ahead), spread)[1]
-        closes = _closes(motion, ahead, gate) | (chi2 < AS_STATED * len(chain.axes))
-        out[first[closes]] = out[second[closes]] = True
+        closing = closes(motion, ahead, limits) | (chi2 < AS_STATED * len(chain.axes))
+        out[first[closing]] = out[second[closing]] = True
     return int(out.sum())
 
 
@@ -81,7 +83,7 @@ AS_STATED = 3.0
 """χ² to an axis of a cycle that closes as its edges state: of right ones 4e-5 have more in space, 3 % in the plane."""
 
 
-def _gate(chain: Chain) -> tuple[float, float]:
+def gate(chain: Chain) -> tuple[float, float]:
     """Metres and radians to which cycles of right edges close."""
     inner = np.flatnonzero(chain.step_edge >= 0)
     shift = np.linalg.norm(chain.step[inner, :3, 3], axis=1)
@@ -97,7 +99,8 @@ def _between(poses: Floats, a: Ints, b: Ints) -> Floats:
     return np.asarray(se3.inverse(poses[a]) @ poses[b])
 
 
-def _closes(motion: Floats, other: Floats, gate: tuple[float, float]) -> Bools:
+def closes(motion: Floats, other: Floats, limits: tuple[float, float], widened: Floats | float = 1.0) -> Bools:
+    """Which motions (K, 4, 4) are the same as others but for so many times the metres and radians of `gate`."""
     left = se3.inverse(motion) @ other
-    near = np.linalg.norm(left[:, :3, 3], axis=1) < gate[0]
-    return np.asarray(near & (np.linalg.norm(se3.so3_log(left[:, :3, :3]), axis=1) < gate[1]))
+    near = np.linalg.norm(left[:, :3, 3], axis=1) < limits[0] * widened
+    return np.asarray(near & (np.linalg.norm(se3.so3_log(left[:, :3, :3]), axis=1) < limits[1] * widened))

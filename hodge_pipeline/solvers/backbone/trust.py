@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtri
 
-from hodge_pipeline.complex.judging import chi2_by_information
+from hodge_pipeline.complex.judging import chi2_by_information, has_unit_information
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone.bridged import MOST_BREAKS, infer_bridged
 from hodge_pipeline.solvers.backbone.chain import (
@@ -24,9 +24,10 @@ from hodge_pipeline.solvers.backbone.fit import Linear
 from hodge_pipeline.solvers.backbone.inference import Inferred
 from hodge_pipeline.solvers.backbone.parallel import Fused, fused
 from hodge_pipeline.solvers.backbone.polish import LOCAL
-from hodge_pipeline.solvers.backbone.step_tests import agreeing_loops, is_tested
+from hodge_pipeline.solvers.backbone.step_tests import LOOPS_AT_A_STEP, agreeing_loops, is_tested
+from hodge_pipeline.solvers.backbone.window import windowed
 from hodge_pipeline.solvers.maximum_likelihood import solve
-from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+from hodge_pipeline.types import Bools, Floats, ViewGraph
 from hodge_pipeline.types.text import counted
 
 AUTO, SEQUENTIAL, NONE = "auto", "sequential", "none"
@@ -36,8 +37,6 @@ loops must join: one path 10, ten or more 100.
 """
 COVERED = 0.9
 """Of the vertices that consecutive edges must join, so that a sequence is a backbone."""
-LOOPS_AT_A_STEP = 0.5
-"""From there on loops may make a lattice, or a room, in which no edge needs to be trusted."""
 AGREEING = 0.05
 """Where loops are many: to each step, loops that the backbone refuses though they agree with each other, from where on
 it may be the backbone that is wrong: see `backbone_anyway`.
@@ -52,8 +51,10 @@ class Backbone:
 
     - `steps`, `used (E,)`: edges of the backbone, and all that count: a step that does not is broken; `right (E,)`:
       the probability of each loop, NaN for steps; `chi2 (E,)`: of each loop at the poses that the others lead to.
-    - `loop_width (M,)`: factors on the standard deviations of the chain's loops for the last solve.
-    - `alike (E,)`: of an edge that states the same step again the row of the chain's, of all others their own.
+    - `loop_width (M,)`, `step_width (E,)`: factors on the standard deviations of the chain's loops and of `steps` for
+      the last solve.
+    - `part (E,)`: of `steps` those that state others of them again, one or several; `contradicted (E,)`: steps and
+      loops that do not count, since edges over the same steps contradict them.
     - `world_from_cam (V, 4, 4)`: each path begins at the identity where no loop ties it.
     - `doubted`: whether many loops agree with each other and not with the backbone, which may be what is wrong, or say
       that it is broken at several steps.
@@ -66,7 +67,9 @@ class Backbone:
     right: Floats
     chi2: Floats
     loop_width: Floats
-    alike: Ints
+    part: Bools
+    contradicted: Bools
+    step_width: Floats
     world_from_cam: Floats
     doubted: bool
 
@@ -75,7 +78,7 @@ class Backbone:
         graph, _ = believed(graph, self.steps)
         step, loop = self.found.scales.units(self.chain)
         width = np.ones((graph.edge_count, len(self.chain.axes)))
-        width[self.steps] = step * LOCAL
+        width[self.steps] = step * LOCAL * self.step_width[self.steps, None]
         width[self.chain.loop_edge] = loop * self.loop_width[:, None]
         whole = np.ones((graph.edge_count, 6))
         whole[:, self.chain.axes] = width
@@ -98,12 +101,13 @@ class Backbone:
     @property
     def note(self) -> str:
         """What was trusted and what that led to."""
-        loops, used = len(self.chain.loop_edge), int(self.loops_used.sum())
-        trusted = f"{int(self.steps.sum())} consecutive edges are trusted as a backbone"
+        loops, used, more = len(self.chain.loop_edge), int(self.loops_used.sum()), int(self.part.sum())
+        again = f" and {more} that state the same steps again" if more else ""
+        trusted = f"{int(self.steps.sum()) - more} consecutive edges{again} are trusted as a backbone"
         if not self.found.confirmed:
             return f"{trusted}, {counted(loops, 'loop')} that nothing confirms: the poses are the backbone's"
         broken = int((self.steps & ~self.used).sum())
-        said = f", {broken} of them called wrong by the loops over it" if broken else ""
+        said = f", {broken} of them called wrong by the others or the loops" if broken else ""
         errors = "" if self.chain.stated else "; errors as loops show them, since the information lacks some"
         return f"{trusted}{said}, {used} of {loops} loops confirmed{errors}"
 
@@ -120,8 +124,9 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
         return None
     again = consecutive_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
     one = fused(graph, again)
+    one = windowed(one) if trust in (AUTO, SEQUENTIAL) else one
     backbone = _found(one.graph, trust, anyway)
-    return backbone and _of_all_edges(backbone, one)
+    return backbone and _of_all_edges(graph, backbone, one)
 
 
 def _found(graph: ViewGraph, trust: str, anyway: bool) -> Backbone | None:
@@ -181,15 +186,41 @@ def _backbone(
     chi2[chain.loop_edge] = found.judged.chi2
     poses = np.empty((graph.vertex_count, 4, 4))
     poses[chain.order] = solved[0].poses
-    return Backbone(chain, found, steps, used, right, chi2, solved[1], np.arange(graph.edge_count), poses, doubted)
+    none = np.zeros_like(used)
+    return Backbone(chain, found, steps, used, right, chi2, solved[1], none, none, np.ones(len(used)), poses, doubted)
 
 
-def _of_all_edges(backbone: Backbone, one: Fused) -> Backbone:
-    """The backbone of the graph whose edges were fused."""
+def _of_all_edges(graph: ViewGraph, backbone: Backbone, one: Fused) -> Backbone:
+    """The backbone of the graph whose edges were fused: a part of steps counts where none of these is broken."""
     chain, rows = backbone.chain, np.append(one.rows, -1)
-    columns = {name: getattr(backbone, name)[one.alike] for name in ("steps", "used", "right", "chi2")}
     chain = replace(chain, step_edge=rows[chain.step_edge], loop_edge=one.rows[chain.loop_edge])
-    return replace(backbone, chain=chain, alike=one.rows[one.alike], **columns)
+    steps, used, part, contradicted = np.zeros((4, graph.edge_count), bool)
+    right, chi2 = np.full((2, graph.edge_count), np.nan)
+    steps[one.rows], used[one.rows] = backbone.steps, backbone.used
+    right[one.rows], chi2[one.rows] = backbone.right, backbone.chi2
+    part[one.part] = steps[one.part] = contradicted[one.contradicted] = True
+    used &= ~(steps & contradicted)
+    contradicted &= ~used
+    low, high = chain.spans(graph.edges[one.part]).T
+    broken = np.cumsum(chain.bridged & (chain.step_edge >= 0))
+    again = (high - low == 1) & contradicted[chain.step_edge[high]]
+    used[one.part], contradicted[one.part] = (broken[low] == broken[high]) & ~again, again
+    step_width = np.ones(graph.edge_count)
+    if has_unit_information(graph):  # what states a step n times, or g steps, has as much less to say of one
+        spans = chain.spans(graph.edges[steps])
+        times = np.median(chain.over(spans)[chain.step_edge >= 0])
+        step_width[steps] = np.sqrt(times * np.diff(spans, axis=1)[:, 0])
+    return replace(
+        backbone,
+        chain=chain,
+        steps=steps,
+        used=used,
+        right=right,
+        chi2=chi2,
+        part=part,
+        contradicted=contradicted,
+        step_width=step_width,
+    )
 
 
 def of_every_loop(graph: ViewGraph, backbone: Backbone, trusted: Bools) -> Backbone:

@@ -1,0 +1,172 @@
+"""Odometry that registers each frame to several before it: one backbone of all edges over a few steps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hodge_pipeline import se3
+from hodge_pipeline.complex.judging import has_unit_information
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.robust import solve_robust
+from hodge_pipeline.solvers.backbone.chain import consecutive_edges
+from hodge_pipeline.solvers.backbone.parallel import Fused
+from hodge_pipeline.solvers.backbone.trust import find_backbone
+from hodge_pipeline.solvers.backbone.window import windowed
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+from tests.backbone_graphs import STEP, Drive, drive
+
+
+def with_window(made: Drive, reach: int, *, wrong: float = 0.0, seed: int = 0) -> tuple[Drive, Ints]:
+    """The graph and, behind its edges, one over each 2 to `reach` steps, some written the other way round, a share of
+    them `wrong`; and the rows of these.
+    """
+    rng, graph = np.random.default_rng(seed), made.graph
+    count, planar = graph.vertex_count, graph.dimension == 2
+    edges = np.concatenate([np.stack([np.arange(count - g), np.arange(g, count)], axis=1) for g in range(2, reach + 1)])
+    size = np.sqrt(np.diff(edges, axis=1)) * np.repeat(STEP, 3)
+    motions = se3.inverse(made.truth[edges[:, 0]]) @ made.truth[edges[:, 1]]
+    motions = motions @ se3.exp(_noise(rng, size, planar))
+    off = rng.random(len(edges)) < wrong
+    motions[off] = motions[off] @ se3.exp(_noise(rng, np.tile(np.repeat([0.5, 3.0], 3), (off.sum(), 1)), planar))
+    information = np.zeros((len(edges), 6, 6))
+    axes = [2, 3, 4] if planar else range(6)
+    information[:, axes, axes] = 1 / size[:, axes] ** 2
+    back = rng.random(len(edges)) < 0.3
+    edges[back], motions[back] = edges[back, ::-1], se3.inverse(motions[back])
+    information[back] = se3.pull_back(motions[back], information[back])
+    window = ViewGraph.from_edges(
+        graph.vertex_ids, edges, motions, information, str(graph.source[0]), dimension=graph.dimension
+    )
+    whole = replace(made, graph=ViewGraph.joined([graph, window]), right=np.concatenate([made.right, ~off]))
+    return whole, np.flatnonzero(off) + graph.edge_count
+
+
+def _noise(rng: np.random.Generator, size: Floats, planar: bool) -> Floats:
+    out = rng.normal(size=size.shape) * size
+    out[:, [0, 1, 5] if planar else []] = 0.0
+    return np.asarray(out)
+
+
+def whole(graph: ViewGraph) -> Fused:
+    rows = np.arange(graph.edge_count)
+    return Fused(graph, rows, rows[:0], rows[:0])
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("reach", [2, 5, 25])
+def test_a_window_and_its_steps_are_one_backbone(dimension: int, reach: int) -> None:
+    """Each step was in short cycles, so that no backbone was sought: 18 m where odometry has 4."""
+    made, _ = with_window(drive(dimension=dimension, world="corridor", wrong=0.7, in_groups=True, loops=80), reach)
+    found = diagnose(made.graph)
+    assert not (found.kept & ~made.right).any() and (made.right & ~found.kept).sum() <= 2
+    assert made.error_m(found.world_from_cam) < 0.5 * made.error_m(made.odometry())
+
+
+def test_loops_that_nothing_confirms_leave_what_the_window_says() -> None:
+    made, _ = with_window(drive(world="town", wrong=1.0, in_groups=True, loops=100), 3)
+    found = diagnose(made.graph)
+    np.testing.assert_array_equal(found.kept, made.right)
+    assert made.error_m(found.world_from_cam) < made.error_m(made.odometry())
+    assert any("that state the same steps again" in note for note in found.notes)
+
+
+def test_wrong_steps_and_wrong_edges_of_a_window_are_named() -> None:
+    made, off = with_window(drive(wrong=0.5, loops=80), 3, wrong=0.03)
+    graph, steps = made.graph, np.array([40, 41, 200, 333])
+    motions = graph.i_from_j.copy()
+    motions[steps] = motions[steps] @ se3.exp(np.array([0, 0, 0.5, 3.0, -2.0, 0]))
+    right = made.right.copy()
+    right[steps] = False
+    found = diagnose(replace(graph, i_from_j=motions))
+    np.testing.assert_array_equal(found.kept, right)
+    for row in (*steps, *off):
+        assert found.verdict[row] == "wrong"
+        assert "the other edges over the same steps contradict it" in found.reason[row]
+    assert made.error_m(found.world_from_cam) < 0.5 * made.error_m(made.odometry())
+
+
+def test_a_break_under_all_of_the_window_is_found_by_the_loops() -> None:
+    """A robot that is carried off: what passes over that step errs alike."""
+    made, _ = with_window(drive(wrong=0.3, loops=80), 3)
+    graph, at = made.graph, 150
+    low, high = np.sort(graph.edges, axis=1).T
+    over = (low <= at) & (high > at) & (high - low <= 3)
+    carried = se3.exp(np.array([0, 0, 0.5, 5.0, 0, 0]))
+    beyond = made.truth.copy()
+    beyond[at + 1 :] = beyond[at] @ carried @ se3.inverse(beyond[at]) @ beyond[at + 1 :]
+    motions = graph.i_from_j.copy()
+    motions[over] = (se3.inverse(beyond[graph.edges[:, 0]]) @ beyond[graph.edges[:, 1]])[over]
+    found = diagnose(replace(graph, i_from_j=motions))
+    np.testing.assert_array_equal(found.kept, made.right & ~over)
+    assert set(found.verdict[over]) == {"wrong"} and made.error_m(found.world_from_cam) < 1.0
+
+
+def test_many_steps_are_known_as_all_edges_over_them_tell() -> None:
+    """Edges over g steps as exact as those make a step g times as certain: 1 + 2 + 3 times in all."""
+    made = drive(wrong=0.0, loops=10)
+    graph = with_window(made, 3)[0].graph
+    one = windowed(whole(graph))
+    np.testing.assert_array_equal(one.rows, np.arange(made.graph.edge_count))
+    inner = np.flatnonzero(consecutive_edges(one.graph))[3:-3]
+    stated = made.graph.information[inner][:, [2, 3, 4], [2, 3, 4]]
+    told = one.graph.information[inner][:, [2, 3, 4], [2, 3, 4]]
+    ratio = told / stated
+    assert 5.5 < np.median(ratio[:, 1:]) < 6.5
+    off = se3.log(se3.inverse(_exact(made, inner)) @ one.graph.i_from_j[inner])
+    before = se3.log(se3.inverse(_exact(made, inner)) @ graph.i_from_j[inner])
+    assert np.square(off).mean() < 0.7 * np.square(before).mean()
+
+
+def _exact(made: Drive, rows: Ints) -> Floats:
+    i, j = made.graph.edges[rows].T
+    return np.asarray(se3.inverse(made.truth[i]) @ made.truth[j])
+
+
+@pytest.mark.parametrize("wrong", [0.2, 1.0])
+def test_near_edges_that_do_not_agree_are_no_window(wrong: float) -> None:
+    """As in a room every pair of whose views was tried, or where a front end takes for the same what it just left."""
+    one = whole(with_window(drive(wrong=0.0), 4, wrong=wrong)[0].graph)
+    assert windowed(one) is one
+
+
+def test_few_near_edges_are_no_window() -> None:
+    one = whole(drive(wrong=0.0, short=150).graph)
+    assert windowed(one) is one
+
+
+def test_where_information_is_unknown_steps_err_as_they_close() -> None:
+    """A radian weighed as a metre, rotations erred three times as much as stated and right edges were out."""
+    made, _ = with_window(drive(world="corridor", wrong=0.5, loops=80), 8)
+    unknown = replace(made.graph, information=np.tile(np.eye(6), (made.graph.edge_count, 1, 1)))
+    assert has_unit_information(windowed(whole(unknown)).graph)
+    found = solve_robust(unknown)
+    np.testing.assert_array_equal(found.weights > 0, made.right)
+    assert made.error_m(found.world_from_cam) < 0.1 * made.error_m(made.odometry())
+
+
+@pytest.mark.parametrize("stated", [True, False])
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e6])
+def test_an_exact_window_in_any_unit_is_one(stated: bool, unit: float) -> None:
+    made, _ = with_window(drive(wrong=0.0, loops=20), 3)
+    graph, (i, j) = made.graph, made.graph.edges.T
+    motions = se3.inverse(made.truth[i]) @ made.truth[j]
+    information = graph.information if stated else np.tile(np.eye(6), (len(i), 1, 1))
+    if unit != 1.0:
+        motions = se3.rescaled(motions, unit)
+        information = se3.rescaled_information(information, unit) if stated else information
+    exact = replace(graph, i_from_j=motions, information=information)
+    one = windowed(whole(exact))
+    assert len(one.part) > 700 and not len(one.contradicted)
+    found = diagnose(exact)
+    assert found.kept.all() and made.error_m(se3.rescaled(found.world_from_cam, 1 / unit)) < 1e-6
+
+
+def test_edges_of_a_window_are_loops_beside_the_edges_of_a_source() -> None:
+    graph = with_window(drive(wrong=0.0, loops=60), 3)[0].graph
+    steps: Bools = np.arange(graph.edge_count) < graph.vertex_count - 1
+    backbone = find_backbone(replace(graph, source=np.where(steps, "wheels", "scans")), "wheels")
+    assert backbone is not None
+    np.testing.assert_array_equal(backbone.steps, steps)
