@@ -127,6 +127,10 @@ LEAST_SHARE = 1e-3
 EVEN = np.full(2, 0.5)
 DECOYS = 4
 """To a loop: with one, scales of loops differed up to eightfold from one draw to the next."""
+FEWEST_LOOPS = 10
+"""Within the paths that were joined, so that these alone are learned from: a bridge between paths allows for errors
+much larger than those of steps, which were found to be a quarter of what they are then.
+"""
 MOST_LOOPS = 3000
 """That scales are learned from: more tell hardly more."""
 
@@ -170,8 +174,11 @@ def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Flo
     Each loop counts by itself: that loops at one place err alike, and steps too, would else be taken for small errors.
     Decoys, motions of loops between other places, tell what as many would explain by chance at each scale.
     """
-    alone = _learned_from(chain.path, np.arange(len(chain.ends)), chain.ends)
-    of_decoys = _learned_from(chain.path, *decoys(chain, DECOYS))
+    path = chain.path * (chain.size + 1) + np.cumsum(chain.bridged & (chain.step_edge < 0))  # before they were joined
+    if (path[chain.ends[:, 0]] == path[chain.ends[:, 1]]).sum() < FEWEST_LOOPS:
+        path = chain.path
+    alone = _learned_from(path, np.arange(len(chain.ends)), chain.ends)
+    of_decoys = _learned_from(path, *decoys(chain, DECOYS))
     rows, ends = (np.concatenate(each) for each in zip(alone, of_decoys, strict=True))
     models = _Model.of(chain.with_loops(rows, ends), poses, wrong)
     own, elsewhere = models.select(slice(len(alone[0]))), models.select(slice(len(alone[0]), None))
@@ -244,7 +251,7 @@ def decoys(chain: Chain, times: int) -> tuple[Ints, Ints]:
 
 
 def _learned_from(path: Ints, loop: Ints, ends: Ints) -> tuple[Ints, Ints]:
-    """Those of the loops and their ends that scales are learned from."""
+    """Those of the loops within a path and their ends that scales are learned from."""
     rows = np.flatnonzero(path[ends[:, 0]] == path[ends[:, 1]])
     if len(rows) > MOST_LOOPS:
         rows = np.sort(np.random.default_rng(0).choice(rows, MOST_LOOPS, replace=False))
