@@ -10,6 +10,7 @@ import pytest
 from hodge_pipeline import se3
 from hodge_pipeline.complex.judging import has_unit_information
 from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.solvers.backbone.chain import consecutive_edges
 from hodge_pipeline.solvers.backbone.parallel import Fused
@@ -63,6 +64,8 @@ def test_a_window_and_its_steps_are_one_backbone(dimension: int, reach: int) -> 
     found = diagnose(made.graph)
     assert not (found.kept & ~made.right).any() and (made.right & ~found.kept).sum() <= 2
     assert made.error_m(found.world_from_cam) < 0.5 * made.error_m(made.odometry())
+    asked_for = diagnose(made.graph, DiagnosisOptions(trust="sequential"))
+    np.testing.assert_array_equal(asked_for.kept, found.kept)
 
 
 def test_loops_that_nothing_confirms_leave_what_the_window_says() -> None:

@@ -21,7 +21,7 @@ REGISTERED_FREEDOM = 30.0
 """As `FREEDOM`, of edges that a run registered, accepted and kept: red kitchen, fr1/xyz, fr1/rpy, rendered rooms. 10 to
 100 do as well; a gate makes fr1 worse, and 4 makes red kitchen's rotations from frame to frame worse.
 """
-MEDIAN_CHI2 = {3: 2.366, 6: 5.348}
+MEDIAN_CHI2 = {1: 0.455, 3: 2.366, 6: 5.348}
 EXACT = 1e-9
 """Of the largest χ²: edges in no cycle fit exactly, and tell nothing about the usual χ²."""
 UNMEASURED = 1e-9

@@ -86,9 +86,7 @@ class Chain:
 
     def spans(self, edges: Ints) -> Ints:
         """The positions (K, 2) of two vertices each, the lower first."""
-        place = np.empty(self.size, np.int64)
-        place[self.order] = np.arange(self.size)
-        return np.sort(place[edges], axis=1)
+        return np.sort(np.argsort(self.order)[edges], axis=1)
 
     def over(self, ends: Ints, worth: Floats | None = None) -> Floats:
         """How many of the spans (K, 2) of positions, or how much of their `worth (K,)`, pass over each step (n,)."""
@@ -126,10 +124,15 @@ class Chain:
 
 def consecutive_edges(graph: ViewGraph) -> Bools:
     """Edges (E,) between vertices that follow each other in the order of their ids."""
+    return np.asarray(steps_apart(graph) == 1)
+
+
+def steps_apart(graph: ViewGraph) -> Ints:
+    """How far apart the vertices of each edge (E,) lie in the order of their ids."""
     ranks = graph.edges
     if graph.vertex_ids.dtype.kind in "iu":
         ranks = np.argsort(np.argsort(graph.vertex_ids, kind="stable"), kind="stable")[ranks]
-    return np.asarray(np.abs(ranks[:, 0] - ranks[:, 1]) == 1)
+    return np.asarray(np.abs(ranks[:, 0] - ranks[:, 1]))
 
 
 def sequential_edges(graph: ViewGraph) -> Bools:

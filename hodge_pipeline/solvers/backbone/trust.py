@@ -51,8 +51,7 @@ class Backbone:
 
     - `steps`, `used (E,)`: edges of the backbone, and all that count: a step that does not is broken; `right (E,)`:
       the probability of each loop, NaN for steps; `chi2 (E,)`: of each loop at the poses that the others lead to.
-    - `loop_width (M,)`, `step_width (E,)`: factors on the standard deviations of the chain's loops and of `steps` for
-      the last solve.
+    - `loop_width (M,)`: factors on the standard deviations of the chain's loops for the last solve.
     - `part (E,)`: of `steps` those that state others of them again, one or several; `contradicted (E,)`: steps and
       loops that do not count, since edges over the same steps contradict them.
     - `world_from_cam (V, 4, 4)`: each path begins at the identity where no loop ties it.
@@ -69,16 +68,19 @@ class Backbone:
     loop_width: Floats
     part: Bools
     contradicted: Bools
-    step_width: Floats
     world_from_cam: Floats
     doubted: bool
 
     def weighted(self, graph: ViewGraph) -> ViewGraph:
         """The graph of the edges that count, with the information that their errors were found to have."""
-        graph, _ = believed(graph, self.steps)
         step, loop = self.found.scales.units(self.chain)
         width = np.ones((graph.edge_count, len(self.chain.axes)))
-        width[self.steps] = step * LOCAL * self.step_width[self.steps, None]
+        width[self.steps] = step * LOCAL
+        if has_unit_information(graph):  # what states a step n times, or g steps, has as much less to say of one
+            spans = self.chain.spans(graph.edges[self.steps])
+            times = np.median(self.chain.over(spans)[self.chain.step_edge >= 0])
+            width[self.steps] *= np.sqrt(times * np.diff(spans, axis=1))
+        graph, _ = believed(graph, self.steps)
         width[self.chain.loop_edge] = loop * self.loop_width[:, None]
         whole = np.ones((graph.edge_count, 6))
         whole[:, self.chain.axes] = width
@@ -187,7 +189,7 @@ def _backbone(
     poses = np.empty((graph.vertex_count, 4, 4))
     poses[chain.order] = solved[0].poses
     none = np.zeros_like(used)
-    return Backbone(chain, found, steps, used, right, chi2, solved[1], none, none, np.ones(len(used)), poses, doubted)
+    return Backbone(chain, found, steps, used, right, chi2, solved[1], none, none, poses, doubted)
 
 
 def _of_all_edges(graph: ViewGraph, backbone: Backbone, one: Fused) -> Backbone:
@@ -205,11 +207,6 @@ def _of_all_edges(graph: ViewGraph, backbone: Backbone, one: Fused) -> Backbone:
     broken = np.cumsum(chain.bridged & (chain.step_edge >= 0))
     again = (high - low == 1) & contradicted[chain.step_edge[high]]
     used[one.part], contradicted[one.part] = (broken[low] == broken[high]) & ~again, again
-    step_width = np.ones(graph.edge_count)
-    if has_unit_information(graph):  # what states a step n times, or g steps, has as much less to say of one
-        spans = chain.spans(graph.edges[steps])
-        times = np.median(chain.over(spans)[chain.step_edge >= 0])
-        step_width[steps] = np.sqrt(times * np.diff(spans, axis=1)[:, 0])
     return replace(
         backbone,
         chain=chain,
@@ -219,7 +216,6 @@ def _of_all_edges(graph: ViewGraph, backbone: Backbone, one: Fused) -> Backbone:
         chi2=chi2,
         part=part,
         contradicted=contradicted,
-        step_width=step_width,
     )
 
 

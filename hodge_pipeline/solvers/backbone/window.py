@@ -15,7 +15,14 @@ from hodge_pipeline.complex.judging import (
     chi2_by_information,
     has_unit_information,
 )
-from hodge_pipeline.solvers.backbone.chain import STEPS_OF_PLACE, Chain, linear_forest, make_chain, sequential_edges
+from hodge_pipeline.solvers.backbone.chain import (
+    STEPS_OF_PLACE,
+    Chain,
+    linear_forest,
+    make_chain,
+    sequential_edges,
+    steps_apart,
+)
 from hodge_pipeline.solvers.backbone.evidence import gaussian, turns
 from hodge_pipeline.solvers.backbone.fit import inverse, linearise
 from hodge_pipeline.solvers.backbone.judge import by_path
@@ -29,8 +36,6 @@ AGREEING = 0.9
 """Of those edges, that agree with each other and the steps. Of edges between fragments of rooms, every pair of which
 was tried, .69 to .84 do, of the cubicle's .6; of graphs whose odometry has a window nearly all.
 """
-MEDIAN_SQUARE = 0.455
-"""Of a standard normal number."""
 ROUNDS = 10
 TOLERANCE, LEAST = 1e-4, 1e-9
 """How precisely their poses are solved for, of χ²; and the least weight, so that they do not fall into pieces."""
@@ -41,8 +46,10 @@ def windowed(one: Fused) -> Fused:
     and nearly all of them agree. A step that they contradict is what they say of it.
     """
     graph = one.graph
-    steps = linear_forest(graph.edges, graph.vertex_count, sequential_edges(graph))
-    chain = make_chain(graph, steps)
+    steps, apart = sequential_edges(graph), steps_apart(graph)
+    if ((apart > 0) & (apart <= LONGEST)).sum() <= (1 + LOOPS_AT_A_STEP) * steps.sum():
+        return one  # nor need a chain be made for it
+    chain = make_chain(graph, linear_forest(graph.edges, graph.vertex_count, steps))
     at, near = np.flatnonzero(chain.step_edge >= 0), _near(chain)
     if not _many(chain, near):
         return one
@@ -97,7 +104,7 @@ def _as_they_close(chain: Chain, near: Ints) -> Chain:
     squares = linearise(chain, chain.poses).loops[0][near] ** 2 / np.diff(ends, axis=1)
     unit = float(np.mean(chain.log(chain.step)[:, turns(chain) :] ** 2))
     for kind, least in ((slice(0, turns(chain)), 1.0), (slice(turns(chain), None), max(unit, EXACT))):
-        variance[kind] = max(np.median(squares[:, kind]) / MEDIAN_SQUARE / 2, EXACT**2 * least)
+        variance[kind] = max(np.median(squares[:, kind]) / MEDIAN_CHI2[1] / 2, EXACT**2 * least)
     step, loop = np.zeros_like(chain.step_covariance), chain.covariance.copy()
     step[chain.step_edge >= 0] = np.diag(variance)
     loop[near] = np.diff(ends, axis=1)[:, :, None] * np.diag(variance)
