@@ -9,6 +9,7 @@
     python -m benchmarks.wrong_loops mistaken --seed 1   # walks with a loop a step, many of them mistaken in one way
     python -m benchmarks.wrong_loops lattices --seed 1   # cylinders and grids with 1 to 20 % of all edges wrong
     python -m benchmarks.wrong_loops windows --seed 1    # walks with edges over two steps to ten: a sliding window
+    python -m benchmarks.wrong_loops sessions --seed 1   # walks cut into two to five sessions that loops alone join
 
 Errors are metres RMS of positions after a rigid fit: to the truth, or for graphs of the literature to their own
 solution without the injected loops. WORSE: than 1.02 × the odometry. `--only WORD` takes the graphs whose name has
@@ -358,6 +359,19 @@ def window_cases(seed: int) -> Iterator[Case]:
         yield replace(case, graph=replace(graph, i_from_j=motions), right=right)
 
 
+def session_cases(seed: int) -> Iterator[Case]:
+    """Walks without the steps at one to four places: sessions that only loops join, of which none to .8 are wrong."""
+    kinds = itertools.product(("ring", "corridor", "streets"), (2, 3, 5), (0.0, 0.3, 0.6, 0.8), (1, 5))
+    for number, (kind, sessions, wrong, group) in enumerate(kinds):
+        rng = np.random.default_rng([seed, number])
+        poses, bad, stated = walk(kind, 600, rng), round(150 * wrong), number % 3 < 2
+        name = f"{kind}, {sessions} sessions, {wrong:.0%} of loops wrong by {group}, "
+        case = walked(name + ("stated" if stated else "unknown"), poses, 150 - bad, bad, group, stated, rng)
+        begins = np.linspace(0, len(poses), sessions + 1).astype(int)[1:-1]
+        left = ~(steps(case.graph) & np.isin(case.graph.edges.max(axis=1), begins))
+        yield replace(case, graph=case.graph.select(left), right=case.right[left])
+
+
 KINDS = {
     "random": random_cases,
     "breaks": broken_cases,
@@ -368,6 +382,7 @@ KINDS = {
     "mistaken": mistaken_cases,
     "lattices": lattice_cases,
     "windows": window_cases,
+    "sessions": session_cases,
 }
 
 

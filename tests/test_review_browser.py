@@ -90,6 +90,23 @@ def browser(chromium: Any) -> Iterator[Any]:
     chromium.get("about:blank")  # a scene that nobody looks at any more is drawn all the same
 
 
+@pytest.fixture(scope="module")
+def bare() -> Iterator[Any]:
+    """A browser without WebGL: most of the time goes into drawing scenes without a GPU."""
+    found = start_browser(1000, 700, "--disable-3d-apis")
+    yield found
+    found.quit()
+
+
+def bare_page(browser: Any, address: str) -> Page:
+    """The page without its scene, once it shows the first poses."""
+    page = Page.__new__(Page)
+    page.browser = browser
+    browser.get(address)
+    page.until(lambda: page.data("settled") is not None and page.data("doing") == "")
+    return page
+
+
 @pytest.fixture
 def review(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Review]:
     monkeypatch.setattr(scene, "MOST_POINTS", 20_000)  # drawn without a GPU
@@ -294,23 +311,24 @@ def matching(page: Page, i: int, j: int, i_from_j: Any) -> list[tuple[Any, Any]]
     return [(shown[0][row], shown[1][at[row]]) for row in corners]
 
 
-def test_two_tabs_and_a_stale_decision(browser: Any, review: Review, run_folder: Path) -> None:
-    page, first = Page(browser, review), browser.current_window_handle
+def test_two_tabs_and_a_stale_decision(bare: Any, review: Review, run_folder: Path) -> None:
+    page, first = bare_page(bare, review.address), bare.current_window_handle
     stale, fresh, _ = sorted(PLANTED)
     page.choose(stale)
-    browser.execute_script("events.close()")  # this tab hears of nothing any more
-    browser.switch_to.new_window("tab")
-    other = Page(browser, review)
+    bare.execute_script("events.close()")  # this tab hears of nothing any more
+    bare.switch_to.new_window("tab")
+    other = bare_page(bare, review.address)
     other.choose(fresh)
-    other.decided(lambda: other.click("#disable"))
-    browser.close()
-    browser.switch_to.window(first)
+    other.click("#disable")
+    other.until(lambda: other.data("revision") == "1")
+    bare.close()
+    bare.switch_to.window(first)
     page.click("#disable")
     page.until(lambda: "another page has decided" in page.text("message"))
     assert read_history(run_folder).disabled == (fresh,)
 
 
-def test_a_server_that_is_killed_loses_no_decision(browser: Any, run_folder: Path) -> None:
+def test_a_server_that_is_killed_loses_no_decision(bare: Any, run_folder: Path) -> None:
     name = sorted(PLANTED)[0]
     serve = [sys.executable, "-m", "hodge_pipeline.cli.main", "review", str(run_folder), "--no-browser"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
@@ -319,10 +337,7 @@ def test_a_server_that_is_killed_loses_no_decision(browser: Any, run_folder: Pat
         try:
             assert process.stdout is not None
             address = process.stdout.readline().strip()
-            browser.get(address)
-            page = Page.__new__(Page)
-            page.browser = browser
-            page.until(lambda: page.data("doing") == "")  # noqa: B023
+            page = bare_page(bare, address)
             if start == 1:
                 page.choose(name)
                 page.click("#disable")
@@ -337,21 +352,15 @@ def test_a_server_that_is_killed_loses_no_decision(browser: Any, run_folder: Pat
     assert read_history(run_folder).disabled == (name,)
 
 
-def test_without_webgl_there_is_a_line_and_every_decision(review: Review, run_folder: Path) -> None:
-    bare = start_browser(1000, 700, "--disable-3d-apis")
-    try:
-        bare.get(review.address)
-        script = "return ['main', 'aside'].map(name => document.querySelector(name).getBoundingClientRect().width)"
-        assert min(bare.execute_script(script)) > 950, "in a small window one is above the other"
-        page = Page.__new__(Page)
-        page.browser, page.review = bare, review
-        page.settled()
-        assert "has no WebGL" in page.find("#no-webgl").text and not bare.find_elements("css selector", "#scene")
-        page.choose(sorted(PLANTED)[0])
-        page.decided(lambda: page.press("d"))
-        assert read_history(run_folder).disabled == (sorted(PLANTED)[0],)
-    finally:
-        bare.quit()
+def test_without_webgl_there_is_a_line_and_every_decision(bare: Any, review: Review, run_folder: Path) -> None:
+    page = bare_page(bare, review.address)
+    script = "return ['main', 'aside'].map(name => document.querySelector(name).getBoundingClientRect().width)"
+    assert min(bare.execute_script(script)) > 950, "in a small window one is above the other"
+    assert "has no WebGL" in page.find("#no-webgl").text and not bare.find_elements("css selector", "#scene")
+    page.choose(sorted(PLANTED)[0])
+    page.press("d")
+    page.until(lambda: page.data("revision") == "1")
+    assert read_history(run_folder).disabled == (sorted(PLANTED)[0],)
 
 
 def test_another_origin_gets_no_socket(browser: Any, review: Review) -> None:

@@ -56,6 +56,12 @@ class Testimony:
     away: Floats
     used: Bools
 
+    @classmethod
+    def of(cls, linear: Linear, away: Floats) -> Testimony:
+        """Of loops that nothing explains and none of which is used."""
+        none = np.zeros(len(away))
+        return cls(linear.chain, linear, none, away, none > 0)
+
     def testimonies(self) -> float:
         """How many there are, of which the best is taken: a place makes one."""
         return float((1 / loops_at_place(self.chain.places)).sum())
@@ -70,10 +76,14 @@ class Testimony:
         """Log Bayes factor (K,) of the loops `second` if the loops `first` are right: by the paths between their lower
         ends and between their upper ends, whatever lies between lower and upper.
         """
+        return np.asarray(student(*self.against(first, second))[0] - self.away[second])
+
+    def against(self, first: Ints, second: Ints) -> tuple[Floats, Floats]:
+        """The residuals (K, p), and their covariances (K, p, p), of loops `second` where loops `first` are right."""
         chain, (c, d) = self.chain, self.chain.ends[second].T
         away, covariance = self.beyond(first, c, d)
         residual = chain.log(se3.inverse(chain.motion[second]) @ se3.inverse(self.linear.poses[c]) @ away)
-        return np.asarray(student(residual, covariance + chain.covariance[second])[0] - self.away[second])
+        return residual, covariance + chain.covariance[second]
 
     def beyond(self, loop: Ints, low: Ints, high: Ints) -> tuple[Floats, Floats]:
         """Where these loops take the poses (K, 4, 4) of positions `high`, and the covariance (K, p, p), in the axes

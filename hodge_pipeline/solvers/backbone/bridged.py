@@ -18,18 +18,20 @@ from hodge_pipeline.solvers.backbone.breaks import (
     unusual_breaks,
 )
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
-from hodge_pipeline.solvers.backbone.evidence import Scales, Wrong, learn_scales, mixture
+from hodge_pipeline.solvers.backbone.evidence import Wrong, mixture, student
 from hodge_pipeline.solvers.backbone.fit import Fit, linearise, settled
 from hodge_pipeline.solvers.backbone.inference import (
     BY_CHANCE,
+    MISTAKEN,
     Inferred,
     by_chance,
     infer,
     refused,
 )
 from hodge_pipeline.solvers.backbone.judge import by_path
-from hodge_pipeline.solvers.backbone.places import MOST_STEPS
-from hodge_pipeline.types import Bools
+from hodge_pipeline.solvers.backbone.places import MISTAKEN_PLACES, MOST_STEPS, agreeing_groups
+from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales
+from hodge_pipeline.types import Bools, Ints
 
 MOST_BREAKS, MOST_TRIED = 10, 2
 """That are bridged one after the other, and that are tried each time."""
@@ -99,29 +101,51 @@ def bridged(chain: Chain, broken: Break) -> Chain:
 
 
 def joined(chain: Chain) -> Chain:
-    """The chain with bridges between paths, as of several robots, where loops of several places agree how they lie."""
+    """The chain with bridges between paths, as of several robots, where loops of several places agree how they lie, or
+    more of one place than are mistaken elsewhere.
+    """
     while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
         poses = chain.poses
         wrong = Wrong.of(chain, poses)
         scaled = learn_scales(chain, poses, wrong)[0].applied(chain)
-        linear, rows, none = linearise(scaled, poses), np.arange(len(chain.ends)), np.zeros(len(chain.ends))
-        away = wrong.log_density(scaled, rows, linear.loops[0], by_path(linear, rows))
-        told = Testimony(scaled, linear, none, away, none > 0)
-        pairs = chain.path[chain.ends]
-        best, found = BY_CHANCE + float(np.log(len(pairs))), None
-        for low, high in np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0).tolist():
-            rows = np.flatnonzero((pairs == [low, high]).all(axis=1))
+        linear, rows = linearise(scaled, poses), np.arange(len(chain.ends))
+        covariance = by_path(linear, rows)
+        away = wrong.log_density(scaled, rows, linear.loops[0], covariance)
+        told, pairs = Testimony.of(linear, away), chain.path[chain.ends]
+        apart = pairs[:, 0] != pairs[:, 1]
+        explained = ~apart & (student(linear.loops[0], covariance)[0] > away)
+        groups = agreeing_groups(told, np.flatnonzero(~explained))
+        best, found = 0.0, None
+        for low, high in np.unique(pairs[apart], axis=0).tolist():
+            between = (pairs == [low, high]).all(axis=1)
+            rows = np.flatnonzero(between)
             for seed, factor in told.seeds(rows) if len(rows) > 1 else ():
-                if (score := float(told.gains(seed, rows, factor).sum())) > best:
+                score = float(told.gains(seed, rows, factor).sum()) - BY_CHANCE - float(np.log(len(pairs)))
+                if score > best:
                     best, found = score, (low, high, seed)
+            own = [group for group in groups if between[group[0]]]
+            first = np.array([group[0] for group in own])
+            rivals = np.flatnonzero(told.factor(np.full(len(own), first[0]), first) <= 0)
+            others = [own[each] for each in rivals] + [group for group in groups if not apart[group[0]]]
+            score = -_mistaken(len(own[0]), np.array([len(group) for group in others])) - MISTAKEN
+            if score > best:
+                best, found = score, (low, high, int(first[0]))
         if found is None:
             break
         low, high, seed = found
         last, first = np.flatnonzero(chain.path == low)[-1:], np.flatnonzero(chain.path == high)[:1]
         end, covariance = told.beyond(np.array([seed]), last, first)
-        motion = se3.inverse(poses[last[0]]) @ end[0]
-        chain = linked(chain, low, high, motion, LOOSE**2 * covariance[0])
+        chain = linked(chain, low, high, se3.inverse(poses[last[0]]) @ end[0], LOOSE**2 * covariance[0])
     return chain
+
+
+def _mistaken(size: int, others: Ints) -> float:
+    """The logarithm of how many groups of `size` loops should be mistaken where those of sizes `others (K,)` are, which
+    are taken to be exponential; a loop by itself is no group.
+    """
+    others = others[others > 1]
+    count, total = len(others), float(others.sum())
+    return float(np.log(MISTAKEN_PLACES + count) - (count + 1) * np.log1p(size / (total + 1)))
 
 
 LOOSE = 2.0

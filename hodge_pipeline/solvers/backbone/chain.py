@@ -63,6 +63,16 @@ class Chain:
         """Positions (n,) that a step leads to."""
         return np.asarray((self.step_edge >= 0) | self.bridged)
 
+    @property
+    def broken(self) -> Bools:
+        """Positions (n,) that a broken step led to, where a bridge is."""
+        return self.bridged & (self.step_edge >= 0)
+
+    @property
+    def joins(self) -> Bools:
+        """Positions (n,) that a bridge from another path leads to."""
+        return self.bridged & (self.step_edge < 0)
+
     @cached_property
     def poses(self) -> Floats:
         """World from each position (n, 4, 4), each path composed from the identity."""

@@ -1,18 +1,15 @@
-"""What speaks for a loop: the density of its residual if it is right, against that if it joins places at random; and
-how large errors are, as factors on what the information of steps and loops states.
-"""
+"""What speaks for a loop: the density of its residual if it is right, against that if it joins places at random."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import gammaln
 
 from hodge_pipeline import se3
-from hodge_pipeline.solvers.backbone.chain import MOST_OF_A_STEP, Chain
-from hodge_pipeline.solvers.backbone.fit import linearise, root
+from hodge_pipeline.solvers.backbone.chain import Chain
+from hodge_pipeline.solvers.backbone.fit import root
 from hodge_pipeline.types import Bools, Floats, Ints
 
 PAIRS, FEWEST_PAIRS = 4000, 200
@@ -109,202 +106,8 @@ def student(residual: Floats, covariance: Floats) -> tuple[Floats, Floats]:
     return log_density + 0.5 * chi2 + norm - 0.5 * (FREEDOM + size) * np.log1p(chi2 / FREEDOM), chi2
 
 
-FOLD = np.log(4.0)
-"""Standard deviation of a scale's logarithm beforehand: stated information is seldom wrong by more."""
-FIRST, FINEST = np.log(4.0), np.log(2.0) / 3
-"""Steps of the search, in the logarithm of a scale."""
-MOST_RATIO = np.log(2.0)
-"""Between the scales of rotation and of translation, where information is stated."""
-UNITS, TRIED = np.log(4.0) * np.array([-8, -7, -6, -5, -4, -3, -2, 2, 3, 4, 5, 6, 7, 8]), 3
-"""Logarithms of scales at which the search begins too, and how many of them, the likeliest. Where the information is
-the identity that stands for unknown, rotation and translation have each a unit of their own then.
-"""
-FARTHEST = 3 * np.log(4.0)
-"""Where information is stated, the search begins at such units alone: one that is nearer explains mistaken places."""
-BY_CHANCE = float(np.log(100.0))
-"""Nats by which loops must be likelier there."""
-LEAST_SHARE = 1e-3
-EVEN = np.full(2, 0.5)
-DECOYS = 4
-"""To a loop: with one, scales of loops differed up to eightfold from one draw to the next."""
-FEWEST_LOOPS = 10
-"""Within the paths that were joined, so that these alone are learned from: a bridge between paths allows for errors
-much larger than those of steps, which were found to be a quarter of what they are then.
-"""
-MOST_LOOPS = 3000
-"""That scales are learned from: more tell hardly more."""
-
-
-@dataclass(frozen=True)
-class Scales:
-    """Factors on stated standard deviations: of steps and of loops, each of rotation and of translation."""
-
-    step_turn: float = 1.0
-    step_shift: float = 1.0
-    loop_turn: float = 1.0
-    loop_shift: float = 1.0
-
-    def applied(self, chain: Chain) -> Chain:
-        """The chain with the covariances that follow."""
-        step, loop = self.units(chain)
-        return replace(
-            chain,
-            step_covariance=np.where(
-                chain.bridged[:, None, None], chain.step_covariance, chain.step_covariance * np.outer(step, step)
-            ),
-            covariance=chain.covariance * np.outer(loop, loop),
-        )
-
-    def surprise(self) -> float:
-        """How improbable it is beforehand that steps err by so much more than stated, in nats."""
-        return float(0.5 * (np.log(np.maximum([self.step_turn, self.step_shift], 1.0)) ** 2).sum() / FOLD**2)
-
-    def units(self, chain: Chain) -> tuple[Floats, Floats]:
-        """The factor on each free axis (p,), of steps and of loops."""
-        split, size = turns(chain), len(chain.axes)
-        pairs = (self.step_turn, self.step_shift), (self.loop_turn, self.loop_shift)
-        step, loop = (np.repeat(pair, (split, size - split)) for pair in pairs)
-        return step, loop
-
-
-def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Floats]:
-    """The scales at which the loops' residuals against the bare chain are likeliest, and the shares of right and wrong
-    loops.
-
-    Each loop counts by itself: that loops at one place err alike, and steps too, would else be taken for small errors.
-    Decoys, motions of loops between other places, tell what as many would explain by chance at each scale.
-    """
-    path = chain.path * (chain.size + 1) + np.cumsum(chain.bridged & (chain.step_edge < 0))  # before they were joined
-    if (path[chain.ends[:, 0]] == path[chain.ends[:, 1]]).sum() < FEWEST_LOOPS:
-        path = chain.path
-    alone = _learned_from(path, np.arange(len(chain.ends)), chain.ends)
-    of_decoys = _learned_from(path, *decoys(chain, DECOYS))
-    rows, ends = (np.concatenate(each) for each in zip(alone, of_decoys, strict=True))
-    models = _Model.of(chain.with_loops(rows, ends), poses, wrong)
-    own, elsewhere = models.select(slice(len(alone[0]))), models.select(slice(len(alone[0]), None))
-    share = len(own.residual) / max(len(elsewhere.residual), 1)
-    most = _most(chain)
-
-    def value(logs: Floats, unit: float) -> float:
-        logs = np.minimum(logs, most)
-        ratios = np.array([logs[1] - logs[0], logs[3] - logs[2]])
-        if (chain.stated or not unit) and (np.abs(ratios) > MOST_RATIO + 1e-9).any():
-            return -np.inf
-        prior = -0.5 * float((logs - unit) @ (logs - unit)) / FOLD**2
-        return float(own.value(logs)[0] - share * max(elsewhere.value(logs)[0], 0.0) + prior)
-
-    found = _likeliest(value, 0.0)
-    units = UNITS[np.abs(UNITS) >= FARTHEST] if chain.stated else UNITS
-    values = np.array([value(np.full(4, unit), unit) for unit in units])
-    tried = np.argsort(-values, kind="stable")[:TRIED]
-    tried = tried[values[tried] > found[1]] if chain.stated else tried
-    others = [_likeliest(value, unit) for unit in units[tried].tolist()]
-    other = max(others, key=lambda each: each[1], default=found)
-    found = other if other[1] > found[1] + BY_CHANCE else found
-    logs = np.minimum(found[0], most)
-    return Scales(*map(float, np.exp(logs))), own.value(logs)[1]
-
-
-def _most(chain: Chain) -> Floats:
-    """The logarithms (4,) of the largest scales. An odometry errs by no more than a share of what it moves, step by
-    step, unless it states more: else wrong loops that agree pass for right ones of an odometry that tells nothing.
-    Where something is stated, the error of rotation is bound to that of translation: who goes straight hardly turns.
-    """
-    most = np.full(4, np.inf)
-    steps = (chain.step_edge >= 0) & ~chain.bridged
-    moved, spread = chain.log(chain.step[steps]), np.sqrt(np.einsum("mii->mi", chain.step_covariance[steps]))
-    for kind, axes in enumerate((slice(0, turns(chain)), slice(turns(chain), None))):
-        size, unit = np.linalg.norm(moved[:, axes]), np.linalg.norm(spread[:, axes])
-        if size > 0 and unit > 0 and not (chain.stated and kind == 0):
-            most[kind] = max(np.log(MOST_OF_A_STEP * size / unit), 0.0 if chain.stated else -np.inf)
-    return most
-
-
-def _likeliest(value: Callable[[Floats, float], float], unit: float) -> tuple[Floats, float]:
-    """The logarithms (4,) of scales about that of a unit that have the largest value, and this."""
-    best, width = np.full(4, unit), FIRST
-    top = value(best, unit)
-    while width >= FINEST:
-        axis = still = 0
-        while still < len(best):
-            still += 1
-            for sign in (-1, 1):
-                tried = best.copy()
-                tried[axis % len(best)] += sign * width
-                if (found := value(tried, unit)) > top:
-                    best, top, still = tried, found, 0
-                    break
-            axis += 1
-        width /= 2
-    return best, top
-
-
-def decoys(chain: Chain, times: int) -> tuple[Ints, Ints]:
-    """Each loop (K,), so many times, and two other places (K, 2) of one path, at random."""
-    rng = np.random.default_rng(1)
-    loop = np.repeat(np.arange(len(chain.loop_edge)), times)
-    first = rng.integers(0, chain.size, len(loop))
-    begin = np.searchsorted(chain.path, chain.path[first])
-    length = np.searchsorted(chain.path, chain.path[first], side="right") - begin
-    second = begin + np.minimum((rng.random(len(loop)) * length).astype(np.int64), length - 1)
-    return loop, np.sort(np.stack([first, second], axis=1), axis=1)
-
-
-def _learned_from(path: Ints, loop: Ints, ends: Ints) -> tuple[Ints, Ints]:
-    """Those of the loops within a path and their ends that scales are learned from."""
-    rows = np.flatnonzero(path[ends[:, 0]] == path[ends[:, 1]])
-    if len(rows) > MOST_LOOPS:
-        rows = np.sort(np.random.default_rng(0).choice(rows, MOST_LOOPS, replace=False))
-    return loop[rows], ends[rows]
-
-
-@dataclass(frozen=True)
-class _Model:
-    """Residuals (M, p) of loops, with the covariances of their paths and their own as parts (3, M, p, p): of rotation,
-    of translation, and of both together.
-    """
-
-    chain: Chain
-    wrong: Wrong
-    residual: Floats
-    fixed: Floats
-    path: Floats
-    own: Floats
-
-    @classmethod
-    def of(cls, chain: Chain, poses: Floats, wrong: Wrong) -> _Model:
-        """Of all loops of a chain."""
-        linear, parts = linearise(chain, poses), []
-        for step in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
-            part = replace(linear, chain=Scales(*step, *step).applied(chain))
-            parts.append((part.path(*chain.ends.T), part.loops[1]))
-        path, own = (np.stack(each) for each in zip(*parts, strict=True))
-        fixed, path, own = path[0], path[1:] - path[0], own[1:]
-        for parted in (path, own):
-            parted[2] -= parted[0] + parted[1]
-        return cls(chain, wrong, linear.loops[0], fixed, path, own)
-
-    def select(self, rows: slice) -> _Model:
-        """That of these loops."""
-        chosen = self.chain.with_loops(np.arange(len(self.residual))[rows], self.chain.ends[rows])
-        parts = self.residual[rows], self.fixed[rows], self.path[:, rows], self.own[:, rows]
-        return _Model(chosen, self.wrong, *parts)
-
-    def value(self, logs: Floats) -> tuple[float, Floats]:
-        """The log-likelihood of scales, against all loops being wrong, and the shares of right and wrong loops."""
-        if not len(self.residual):
-            return 0.0, EVEN
-        turn, shift, own_turn, own_shift = np.exp(logs)
-        covariance = self.fixed + _weighed(self.path, turn, shift) + _weighed(self.own, own_turn, own_shift)
-        rows = np.arange(len(self.residual))
-        away = self.wrong.log_density(self.chain, rows, self.residual, covariance)
-        factor = student(self.residual, covariance)[0] - away
-        shares, likelihood = mixture(np.stack([factor, np.zeros_like(factor)]))
-        return likelihood, shares
-
-
-def _weighed(parts: Floats, turn: float, shift: float) -> Floats:
-    return np.asarray(turn**2 * parts[0] + shift**2 * parts[1] + turn * shift * parts[2])
+EVEN, LEAST_SHARE = np.full(2, 0.5), 1e-3
+"""The shares of right and wrong loops before any is looked at, and the least that a class is given."""
 
 
 def mixture(log_densities: Floats) -> tuple[Floats, float]:

@@ -7,12 +7,15 @@ from functools import cached_property
 
 import numpy as np
 
+from hodge_pipeline.solvers.backbone.breaks import Testimony
 from hodge_pipeline.solvers.backbone.chain import Chain, one_of_each_place
-from hodge_pipeline.solvers.backbone.evidence import EVEN, Scales, Wrong, learn_scales, mixture
+from hodge_pipeline.solvers.backbone.evidence import EVEN, Wrong, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, from_rotations, linearise, settled, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, judge
 from hodge_pipeline.solvers.backbone.places import MOST_STEPS, Places, agreeing_groups
 from hodge_pipeline.solvers.backbone.polish import polished
+from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales
+from hodge_pipeline.solvers.resistance import Network, effective_resistance
 from hodge_pipeline.types import Bools, Floats
 
 ROUNDS = 6
@@ -78,7 +81,11 @@ def infer(
 def crowded(start: Linear, alone: Judged) -> list[Bools]:
     """The loops (M,) of each of the `MOST_PLACES` largest groups, of two at least, that a factor > 0 speaks for."""
     rows = np.flatnonzero(alone.factor > 0)
-    groups = [group for group in agreeing_groups(start, alone, rows)[:MOST_PLACES] if len(group) > 1]
+    groups = [
+        group
+        for group in agreeing_groups(Testimony.of(start, alone.log_density[1]), rows)[:MOST_PLACES]
+        if len(group) > 1
+    ]
     return [np.isin(np.arange(len(alone.factor)), group) for group in groups]
 
 
@@ -99,7 +106,7 @@ def _inferred(
 ) -> Inferred | None:
     """The loops judged, at first at the poses that those which are `used (M,)` lead to."""
     chain, linear, number = start.chain, start, 0
-    broken = int((chain.bridged & (chain.step_edge >= 0)).sum())  # any other step might have been the one
+    broken = int(chain.broken.sum())  # any other step might have been the one
     fold = broken * float(np.log(chain.size))
     enough = MISTAKEN + (scales.surprise() if chain.stated else 0.0) + fold
     for _ in range(REARRANGED):
@@ -124,8 +131,20 @@ def _inferred(
     judged = judge(fit.linear, fit, shares, wrong)
     top = mixture(judged.log_density)[1] - float(judged.log_density[1].sum())
     used &= (judged.log_odds > 0) | always
+    used &= ~_lone(chain, used) | always
     linear, reduced = fit.linear if used.any() else start, thinned(chain, np.flatnonzero(used))
     return Inferred(used, judged, scales, start, linear, reduced, top, confirmed)
+
+
+def _lone(chain: Chain, used: Bools) -> Bools:
+    """Which used loops (M,) are all that joins two paths: what they say of these nothing tests."""
+    lone, part = np.zeros_like(used), np.cumsum(chain.step_edge < 0) - 1
+    rows = np.flatnonzero(used & np.not_equal(*part[chain.ends].T))
+    if len(rows):
+        edges = part[chain.ends[rows]]
+        network = Network.of(edges, int(part[-1]) + 1)
+        lone[rows] = np.isinf(effective_resistance(edges, np.ones(len(rows), bool), network))
+    return lone
 
 
 REARRANGED = 3

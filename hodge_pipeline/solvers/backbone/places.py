@@ -16,9 +16,10 @@ from scipy.special import gammaln, pdtrc
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.solvers.backbone.breaks import Testimony
 from hodge_pipeline.solvers.backbone.chain import loops_at_place, one_of_each_place
-from hodge_pipeline.solvers.backbone.evidence import EVEN, FREEDOM, Wrong, decoys, student
+from hodge_pipeline.solvers.backbone.evidence import EVEN, FREEDOM, Wrong, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, settled, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, by_path, judge, left_out
+from hodge_pipeline.solvers.backbone.scales import decoys
 from hodge_pipeline.types import Bools, Floats, Ints
 
 MOST_STEPS = 15
@@ -92,7 +93,7 @@ class Places:
             run = _cut(connected_components(adjacent, len(place)), ends[place])
         by_size = np.lexsort((-loops, run))
         first = by_size[np.unique(run[by_size], return_index=True)[1]]
-        groups = agreeing_groups(start, alone, np.flatnonzero(distance > 1.0))
+        groups = agreeing_groups(Testimony.of(start, alone.log_density[1]), np.flatnonzero(distance > 1.0))
         usual = np.median(loops[first])
         may_be_added = np.array([len(group) >= usual and alone.factor[group[0]] > 0 for group in groups], bool)
         may_be_added[MOST_TRIED:] = False
@@ -224,20 +225,19 @@ def _log_student(chi2: Floats | float, count: int) -> Floats:
     return np.asarray(norm - 0.5 * (FREEDOM + count) * np.log1p(np.asarray(chi2) / FREEDOM))
 
 
-def agreeing_groups(start: Linear, alone: Judged, rows: Ints) -> list[Ints]:
-    """Groups of these loops, the largest first: each of one place, that agree with its first one as the steps between
-    their ends go. Where loops of a place contradict each other, few of them are one testimony. All those of a place
-    where there are too many to compare.
+def agreeing_groups(told: Testimony, rows: Ints) -> list[Ints]:
+    """Groups of these loops (K,), the largest first: each of one place, that agree with its first one as the steps
+    between their ends go. Where loops of a place contradict each other, few of them are one testimony. All those of a
+    place where there are too many to compare.
     """
     if not len(rows):
         return []
-    ends = start.chain.places[rows]
+    ends = told.chain.places[rows]
     tree = cKDTree(ends)
     if loops_at_place(ends).sum() > MOST_PAIRS:
         place = one_of_each_place(ends)
         return sorted((rows[tree.query_ball_point(ends[at], 1.0, p=np.inf)] for at in place), key=len, reverse=True)
     first, second = tree.query_pairs(1.0, p=np.inf, output_type="ndarray").T
-    told = Testimony(start.chain, start, alone.log_density[0], alone.log_density[1], np.zeros(len(alone.factor), bool))
     pairs = np.stack([first, second], axis=1)[told.factor(rows[first], rows[second]) > 0]
     both = np.concatenate([np.repeat(np.arange(len(rows)), 2).reshape(-1, 2), pairs, pairs[:, ::-1]])
     both = both[np.argsort(both[:, 0], kind="stable")]

@@ -157,7 +157,7 @@ def _found(graph: ViewGraph, trust: str, anyway: bool) -> Backbone | None:
     if inferred is None:
         return None
     chain, found = inferred
-    broken = (chain.bridged & (chain.step_edge >= 0)).sum() >= FEW_BREAKS
+    broken = chain.broken.sum() >= FEW_BREAKS
     doubted = trust == AUTO and many_loops
     agree = agreeing_loops(found.scales.applied(chain), ~found.used) if doubted else 0
     doubted = doubted and bool(broken or agree > AGREEING * steps.sum())
@@ -182,7 +182,7 @@ def _backbone(
 ) -> Backbone:
     used, right, chi2 = steps.copy(), np.full(graph.edge_count, np.nan), np.full(graph.edge_count, np.nan)
     used[chain.loop_edge] = found.used
-    used[chain.step_edge[chain.bridged & (chain.step_edge >= 0)]] = False
+    used[chain.step_edge[chain.broken]] = False
     probability = 1 / (1 + np.exp(-np.clip(found.judged.log_odds, -500, 500)))
     right[chain.loop_edge] = np.where(found.used, probability, np.minimum(probability, UNUSED))
     chi2[chain.loop_edge] = found.judged.chi2
@@ -204,7 +204,7 @@ def _of_all_edges(graph: ViewGraph, backbone: Backbone, one: Fused) -> Backbone:
     used &= ~(steps & contradicted)
     contradicted &= ~used
     low, high = chain.spans(graph.edges[one.part]).T
-    broken = np.cumsum(chain.bridged & (chain.step_edge >= 0))
+    broken = np.cumsum(chain.broken)
     again = (high - low == 1) & contradicted[chain.step_edge[high]]
     used[one.part], contradicted[one.part] = (broken[low] == broken[high]) & ~again, again
     return replace(
