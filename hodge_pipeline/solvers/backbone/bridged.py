@@ -104,10 +104,12 @@ def joined(chain: Chain) -> Chain:
     """The chain with bridges between paths, as of several robots, where loops of several places agree how they lie, or
     more of one place than are mistaken elsewhere.
     """
+    scales = None
     while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
         poses = chain.poses
         wrong = Wrong.of(chain, poses)
-        scaled = learn_scales(chain, poses, wrong)[0].applied(chain)
+        scales = scales or learn_scales(chain, poses, wrong)[0]
+        scaled = scales.applied(chain)
         linear, rows = linearise(scaled, poses), np.arange(len(chain.ends))
         covariance = by_path(linear, rows)
         away = wrong.log_density(scaled, rows, linear.loops[0], covariance)

@@ -30,8 +30,6 @@ BY_CHANCE = float(np.log(100.0))
 """Nats by which loops must be likelier there."""
 DECOYS = 4
 """To a loop: with one, scales of loops differed up to eightfold from one draw to the next."""
-FEWEST_LOOPS = 10
-"""Within paths, from which on these alone are learned from."""
 MOST_LOOPS = 3000
 """That scales are learned from: more tell hardly more."""
 
@@ -73,8 +71,8 @@ def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Flo
     loops.
 
     Each loop counts by itself: that loops at one place err alike, and steps too, would else be taken for small errors.
-    Decoys, motions of loops between other places, tell what as many would explain by chance at each scale. Where few
-    loops lie within a path, those between two paths tell by what they say of each other.
+    Decoys, motions of loops between other places, tell what as many would explain by chance at each scale. Of loops
+    between two paths, which may be joined, each is held against the one beside it.
     """
     chain = replace(chain, path=np.cumsum(chain.step_edge < 0) - 1, bridged=chain.broken)  # as before they were joined
     alone = _learned_from(chain.path, np.arange(len(chain.ends)), chain.ends)
@@ -82,13 +80,12 @@ def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Flo
     rows, ends = (np.concatenate(each) for each in zip(alone, of_decoys, strict=True))
     models = _Model.within(chain.with_loops(rows, ends), poses, wrong)
     own, elsewhere = models.select(slice(len(alone[0]))), models.select(slice(len(alone[0]), None))
-    if len(alone[0]) < FEWEST_LOOPS:
-        one, near = _neighbours(chain)
-        own = own.and_of(_Model.beside(chain, poses, wrong, one, near))
-        one, near = np.repeat(one, DECOYS), np.repeat(near, DECOYS)
-        drawn = np.random.default_rng(2).integers(0, len(chain.ends), len(one))
-        elsewhere = elsewhere.and_of(_Model.beside(chain, poses, wrong, one, near, drawn))
-    share = len(own.residual) / max(len(elsewhere.residual), 1)
+    both = [(own, elsewhere)]
+    one, near = _neighbours(chain)
+    if len(one):
+        drawn = np.random.default_rng(2).integers(0, len(chain.ends), DECOYS * len(one))
+        by_chance = _Model.beside(chain, poses, wrong, np.repeat(one, DECOYS), np.repeat(near, DECOYS), drawn)
+        both.append((_Model.beside(chain, poses, wrong, one, near), by_chance))
     most = _most(chain)
 
     def value(logs: Floats, unit: float) -> float:
@@ -97,7 +94,7 @@ def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Flo
         if (chain.stated or not unit) and (np.abs(ratios) > MOST_RATIO + 1e-9).any():
             return -np.inf
         prior = -0.5 * float((logs - unit) @ (logs - unit)) / FOLD**2
-        return float(own.value(logs)[0] - share * max(elsewhere.value(logs)[0], 0.0) + prior)
+        return prior + sum(_beyond_chance(logs, *each) for each in both)
 
     found = _likeliest(value, 0.0)
     units = UNITS[np.abs(UNITS) >= FARTHEST] if chain.stated else UNITS
@@ -109,6 +106,12 @@ def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Flo
     found = other if other[1] > found[1] + BY_CHANCE else found
     logs = np.minimum(found[0], most)
     return Scales(*map(float, np.exp(logs))), own.value(logs)[1]
+
+
+def _beyond_chance(logs: Floats, own: _Model, elsewhere: _Model) -> float:
+    """The log-likelihood of scales beyond what decoys give as many cycles."""
+    share = len(own.residual) / max(len(elsewhere.residual), 1)
+    return float(own.value(logs)[0] - share * max(elsewhere.value(logs)[0], 0.0))
 
 
 def _neighbours(chain: Chain) -> tuple[Ints, Ints]:
@@ -243,14 +246,6 @@ class _Model:
         chosen = self.chain.with_loops(np.arange(len(self.residual))[rows], self.chain.ends[rows])
         parts = self.residual[rows], self.fixed[rows], self.path[:, rows], self.own[:, rows]
         return _Model(chosen, self.wrong, *parts)
-
-    def and_of(self, other: _Model) -> _Model:
-        """That of both models' cycles."""
-        chain = replace(self.chain, ends=np.concatenate([self.chain.ends, other.chain.ends]))
-        mine, others = ((each.residual, each.fixed, each.path, each.own) for each in (self, other))
-        axes = 0, 0, 1, 1
-        both = [np.concatenate(each, axis=axis) for *each, axis in zip(mine, others, axes, strict=True)]
-        return _Model(chain, self.wrong, *both)
 
     def value(self, logs: Floats) -> tuple[float, Floats]:
         """The log-likelihood of scales, against all loops being wrong, and the shares of right and wrong loops."""
