@@ -109,36 +109,39 @@ def joined(chain: Chain) -> Chain:
         poses = chain.poses
         wrong = Wrong.of(chain, poses)
         scales = scales or learn_scales(chain, poses, wrong)[0]
-        scaled = scales.applied(chain)
-        linear, rows = linearise(scaled, poses), np.arange(len(chain.ends))
+        linear, rows = linearise(scales.applied(chain), poses), np.arange(len(chain.ends))
         covariance = by_path(linear, rows)
-        away = wrong.log_density(scaled, rows, linear.loops[0], covariance)
+        away = wrong.log_density(linear.chain, rows, linear.loops[0], covariance)
         told, pairs = Testimony.of(linear, away), chain.path[chain.ends]
         apart = pairs[:, 0] != pairs[:, 1]
-        explained = ~apart & (student(linear.loops[0], covariance)[0] > away)
-        groups = agreeing_groups(told, np.flatnonzero(~explained))
-        best, found = 0.0, None
-        for low, high in np.unique(pairs[apart], axis=0).tolist():
-            between = (pairs == [low, high]).all(axis=1)
-            rows = np.flatnonzero(between)
-            for seed, factor in told.seeds(rows) if len(rows) > 1 else ():
-                score = float(told.gains(seed, rows, factor).sum()) - BY_CHANCE - float(np.log(len(pairs)))
-                if score > best:
-                    best, found = score, (low, high, seed)
-            own = [group for group in groups if between[group[0]]]
-            first = np.array([group[0] for group in own])
-            rivals = np.flatnonzero(told.factor(np.full(len(own), first[0]), first) <= 0)
-            others = [own[each] for each in rivals] + [group for group in groups if not apart[group[0]]]
-            score = -_mistaken(len(own[0]), np.array([len(group) for group in others])) - MISTAKEN
-            if score > best:
-                best, found = score, (low, high, int(first[0]))
-        if found is None:
+        refuted = np.flatnonzero(~apart & (student(linear.loops[0], covariance)[0] < away))
+        mistaken = [len(group) for group in agreeing_groups(told, refuted)]
+        two = np.unique(pairs[apart], axis=0)
+        best = [_joining(told, np.flatnonzero((pairs == both).all(axis=1)), mistaken) for both in two]
+        at = int(np.argmax([score for score, _ in best]))
+        if best[at][0] <= 0:
             break
-        low, high, seed = found
+        low, high = two[at].tolist()
         last, first = np.flatnonzero(chain.path == low)[-1:], np.flatnonzero(chain.path == high)[:1]
-        end, covariance = told.beyond(np.array([seed]), last, first)
+        end, covariance = told.beyond(np.array([best[at][1]]), last, first)
         chain = linked(chain, low, high, se3.inverse(poses[last[0]]) @ end[0], LOOSE**2 * covariance[0])
     return chain
+
+
+def _joining(told: Testimony, rows: Ints, mistaken: list[int]) -> tuple[float, int]:
+    """By how many nats more than enough the loops (K,) between two paths say how these lie, and the one of them that
+    says it: where others of several places agree with it, or more of one place than are mistaken, as those between the
+    paths are that contradict it and those within paths, in groups of these sizes.
+    """
+    best = -np.inf, -1
+    for seed, factor in told.seeds(rows) if len(rows) > 1 else ():
+        score = float(told.gains(seed, rows, factor).sum()) - BY_CHANCE - float(np.log(len(told.away)))
+        best = max(best, (score, seed))
+    groups = agreeing_groups(told, rows)
+    first = np.array([group[0] for group in groups])
+    rivals = np.flatnonzero(told.factor(np.full(len(first), first[0]), first) <= 0)
+    sizes = np.array(mistaken + [len(groups[each]) for each in rivals])
+    return max(best, (-_mistaken(len(groups[0]), sizes) - MISTAKEN, int(first[0])))
 
 
 def _mistaken(size: int, others: Ints) -> float:

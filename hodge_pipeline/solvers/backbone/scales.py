@@ -93,7 +93,7 @@ def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Flo
         ratios = np.array([logs[1] - logs[0], logs[3] - logs[2]])
         if (chain.stated or not unit) and (np.abs(ratios) > MOST_RATIO + 1e-9).any():
             return -np.inf
-        prior = -0.5 * float((logs - unit) @ (logs - unit)) / FOLD**2
+        prior = -0.5 * float((logs - unit) @ (logs - unit) / FOLD**2)
         return prior + sum(_beyond_chance(logs, *each) for each in both)
 
     found = _likeliest(value, 0.0)
