@@ -85,3 +85,14 @@ def test_a_session_that_one_loop_alone_ties_stays_apart() -> None:
     session = graph.edges // 120
     across = found.kept & (session[:, 0] != session[:, 1])
     assert all(np.bincount(session[across].ravel(), minlength=5) != 1)
+
+
+def test_one_loop_joins_sessions_where_hardly_any_is_wrong() -> None:
+    """A right link that alone held a graph together was left out, which came back in pieces."""
+    made = drive(world="ring", count=600, loops=120, wrong=0.0, seed=1)
+    graph, _ = in_sessions(made, 2)
+    apart = np.flatnonzero(np.not_equal(*(graph.edges >= CUT).T))
+    graph = graph.select(np.setdiff1d(np.arange(graph.edge_count), apart[1:]))
+    found = diagnose(graph)
+    assert found.kept.all()
+    assert made.error_m(found.world_from_cam) < 2.0

@@ -102,13 +102,13 @@ def bridged(chain: Chain, broken: Break) -> Chain:
 
 def joined(chain: Chain) -> Chain:
     """The chain with bridges between paths, as of several robots, where loops of several places agree how they lie, or
-    more of one place than are mistaken elsewhere.
+    more of one place than are mistaken elsewhere, or one says it where hardly any are wrong.
     """
-    scales = None
+    learned = None
     while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
         poses = chain.poses
         wrong = Wrong.of(chain, poses)
-        scales = scales or learn_scales(chain, poses, wrong)[0]
+        scales, shares = learned = learned or learn_scales(chain, poses, wrong)
         linear, rows = linearise(scales.applied(chain), poses), np.arange(len(chain.ends))
         covariance = by_path(linear, rows)
         away = wrong.log_density(linear.chain, rows, linear.loops[0], covariance)
@@ -117,7 +117,8 @@ def joined(chain: Chain) -> Chain:
         refuted = np.flatnonzero(~apart & (student(linear.loops[0], covariance)[0] < away))
         mistaken = [len(group) for group in agreeing_groups(told, refuted)]
         two = np.unique(pairs[apart], axis=0)
-        best = [_joining(told, np.flatnonzero((pairs == both).all(axis=1)), mistaken) for both in two]
+        odds = float(np.log(shares[0] / shares[1]))
+        best = [_joining(told, np.flatnonzero((pairs == both).all(axis=1)), mistaken, odds) for both in two]
         at = int(np.argmax([score for score, _ in best]))
         if best[at][0] <= 0:
             break
@@ -128,10 +129,11 @@ def joined(chain: Chain) -> Chain:
     return chain
 
 
-def _joining(told: Testimony, rows: Ints, mistaken: list[int]) -> tuple[float, int]:
+def _joining(told: Testimony, rows: Ints, mistaken: list[int], odds: float) -> tuple[float, int]:
     """By how many nats more than enough the loops (K,) between two paths say how these lie, and the one of them that
     says it: where others of several places agree with it, or more of one place than are mistaken, as those between the
-    paths are that contradict it and those within paths, in groups of these sizes.
+    paths are that contradict it and those within paths, in groups of these sizes. None that is contradicted by no other
+    is less likely than its `odds` beforehand.
     """
     best = -np.inf, -1
     for seed, factor in told.seeds(rows) if len(rows) > 1 else ():
@@ -141,7 +143,8 @@ def _joining(told: Testimony, rows: Ints, mistaken: list[int]) -> tuple[float, i
     first = np.array([group[0] for group in groups])
     rivals = np.flatnonzero(told.factor(np.full(len(first), first[0]), first) <= 0)
     sizes = np.array(mistaken + [len(groups[each]) for each in rivals])
-    return max(best, (-_mistaken(len(groups[0]), sizes) - MISTAKEN, int(first[0])))
+    likely = max(-_mistaken(len(groups[0]), sizes), -np.inf if len(rivals) else odds)
+    return max(best, (likely - MISTAKEN, int(first[0])))
 
 
 def _mistaken(size: int, others: Ints) -> float:

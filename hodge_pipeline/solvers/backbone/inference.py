@@ -129,9 +129,11 @@ def _inferred(
     # wrong loops may have led into a valley that the right ones do not leave
     fit = min((settled(Fit(reduced, begun), MOST_STEPS) for begun in (linear, start)), key=_cost)
     judged = judge(fit.linear, fit, shares, wrong)
-    top = mixture(judged.log_density)[1] - float(judged.log_density[1].sum())
+    shares, likelihood = mixture(judged.log_density)
+    top = likelihood - float(judged.log_density[1].sum())
     used &= (judged.log_odds > 0) | always
-    used &= ~_lone(chain, used) | always
+    if np.log(shares[0] / shares[1]) < MISTAKEN:
+        used &= ~_lone(chain, used) | always
     linear, reduced = fit.linear if used.any() else start, thinned(chain, np.flatnonzero(used))
     return Inferred(used, judged, scales, start, linear, reduced, top, confirmed)
 
