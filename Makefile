@@ -4,7 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
-PYTEST_ARGS ?= -n 2 --dist loadfile --no-loadscope-reorder
+# three on two cores: browsers, hosts and killed servers leave one waiting
+PYTEST_ARGS ?= -n 3 --dist loadfile --no-loadscope-reorder
 BASELINE ?= ../hodge-baseline
 
 .PHONY: help setup demo paper test faults faults-full faults-mutants baseline compare-baseline docs site dist lint format clean
