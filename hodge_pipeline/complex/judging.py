@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import fdtri
 
 from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, Floats, ViewGraph
@@ -38,6 +39,16 @@ def chi2_by_information(graph: ViewGraph, world_from_cam: Floats) -> Floats:
     """χ² (E,) by the graph's own information, 6 on average where information and poses are right."""
     xi = left_over(graph, world_from_cam)
     return np.asarray(np.einsum("ea,eab,eb->e", xi, graph.information, xi))
+
+
+def tail_weight(chi2: Floats | float, axes: int) -> Floats:
+    """The weight that Student's t gives each χ² of so many axes: 1 where it is as expected, more below."""
+    return np.asarray((FREEDOM + axes) / (FREEDOM + np.asarray(chi2)))
+
+
+def tail_gate(axes: int, share: float) -> float:
+    """The χ² beyond which so small a share of right edges lies: by Fisher's F, as Student's t has it."""
+    return axes * float(fdtri(axes, FREEDOM, 1 - share))
 
 
 def student_weight(chi2: Floats, axes: int, *, usual: Floats, registered: bool = False) -> Floats:

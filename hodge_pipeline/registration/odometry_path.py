@@ -9,15 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import fdtri
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.complex.judging import FREEDOM, tail_gate
 from hodge_pipeline.scene import Drift
 from hodge_pipeline.types import Bools, Edges, Floats, Ints
 
-FREEDOM = 4.0
-"""Of Student's distribution of what a right pair and odometry differ by, as of right loops on a backbone."""
 WITNESS = 3.0
 """Nats by which a pair must be likelier, or less likely, after a step is mended to count for that, or against it."""
 FEWEST_FOR, MOST_AGAINST = 3, 0.1
@@ -36,7 +34,7 @@ def drift_of(world_from_cam: Floats, steps: Edges, tail: float | None) -> Drift:
     ends = steps.pairs.max(axis=1, initial=0)
     np.add.at(covariance, ends, se3.carried(world_from_cam[steps.pairs[:, 1]], se3.covariances(steps.information)))
     part = connected_components(steps.pairs, len(world_from_cam))
-    gate = np.inf if tail is None else 6 * float(fdtri(6, FREEDOM, 1 - tail))
+    gate = np.inf if tail is None else tail_gate(6, tail)
     return Drift(world_from_cam, part, np.cumsum(covariance, axis=0), gate)
 
 

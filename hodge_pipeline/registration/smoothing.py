@@ -15,6 +15,7 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.judging import tail_weight
 from hodge_pipeline.one_blas_thread import one_blas_thread
 from hodge_pipeline.types import Floats
 
@@ -25,10 +26,8 @@ every third frame, 0.1 s, is tracked well; key frames 0.7 s apart are not.
 """
 FEWEST = 10
 """Frames of a run: fewer hardly tell acceleration from errors."""
-FREEDOM = 4.0
-"""Of Student's distribution of a frame's error: a blurred one errs by much more than it says."""
 ROUNDS = 3
-"""In which frames are weighed anew by what they are off."""
+"""In which frames are weighed anew by what they are off: a blurred one errs by much more than it says."""
 COARSE, FINE = np.arange(-12.0, 13.0, 4.0), (2.0, 1.0, 0.5)
 """Logarithms of weights that are tried, each of rotation with each of translation: a path in which a hand turns to and
 fro may be likely as noise too; and steps from the likeliest of these.
@@ -55,7 +54,7 @@ def smoothed(world_from_cam: Floats, information: Floats, times_s: Floats) -> Fl
         logs = path.likeliest(weight, logs)
         found = path.solve(weight, logs)
         chi2 = np.einsum("ni,nij,nj->n", found.moves, path.information, found.moves) / found.variance
-        weight = (FREEDOM + 6) / (FREEDOM + chi2)
+        weight = tail_weight(chi2, 6)
     out = world_from_cam.copy()
     out[:, :3, :3] = se3.so3_exp(found.moves[:, :3]) @ out[:, :3, :3]
     out[:, :3, 3] += found.moves[:, 3:]

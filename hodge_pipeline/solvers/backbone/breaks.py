@@ -9,8 +9,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.judging import FREEDOM, tail_weight
 from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place
-from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian, student
+from hodge_pipeline.solvers.backbone.evidence import gaussian, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, root, shifted, without_run
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -173,7 +174,7 @@ class Usual:
             covariance = (left * weight[:, None]).T @ left / len(left)
             covariance += np.diag(LEAST * np.diag(covariance) + np.finfo(float).tiny ** 0.5)
             chi2 = gaussian(left, np.broadcast_to(covariance, (len(left), *covariance.shape)))[1]
-            weight = (FREEDOM + left.shape[1]) / (FREEDOM + chi2)
+            weight = tail_weight(chi2, left.shape[1])
         centres, shares, of_one = _kinds(left, chi2, covariance)
         white = np.linalg.inv(root(covariance[None])[0])
         chi2 = np.min([(((left - centre) @ white.T) ** 2).sum(axis=1) for centre in centres], axis=0)
@@ -262,7 +263,7 @@ def _break(told: Testimony, usual: Usual, loop: int, at: Ints, score: Floats) ->
     whole = np.broadcast_to(covariance[0] + usual.covariance, (len(off), *covariance.shape[1:]))
     kind = int(np.argmax(np.log(usual.shares) + student(off, whole)[0]))
     chi2 = gaussian(off, whole)[1][kind]
-    wide = usual.covariance * max(1.0, float((FREEDOM + chi2) / (FREEDOM + off.shape[1])))
+    wide = usual.covariance * max(1.0, 1 / float(tail_weight(chi2, off.shape[1])))
     towards = wide @ np.linalg.solve(wide + covariance[0], off[kind])
     return Break(int(one[0]), usual.centres[kind] @ told.chain.exp(towards), wide, float(score[row]))
 

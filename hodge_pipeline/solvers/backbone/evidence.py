@@ -8,6 +8,7 @@ import numpy as np
 from scipy.special import gammaln
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.judging import FREEDOM
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.fit import root
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -92,10 +93,6 @@ def gaussian(residual: Floats, covariance: Floats) -> tuple[Floats, Floats]:
     chi2 = np.einsum("mi,mi->m", white, white)
     half_log = np.log(np.einsum("mii->mi", factor)).sum(axis=1) + 0.5 * residual.shape[1] * np.log(2 * np.pi)
     return -0.5 * chi2 - half_log, chi2
-
-
-FREEDOM = 4.0
-"""Of Student's distribution of right loops: their errors have heavier tails than a Gaussian's."""
 
 
 def student(residual: Floats, covariance: Floats) -> tuple[Floats, Floats]:

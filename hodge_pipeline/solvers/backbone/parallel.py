@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import fdtri
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.judging import has_unit_information, in_vertex_order
+from hodge_pipeline.complex.judging import has_unit_information, in_vertex_order, tail_gate
 from hodge_pipeline.solvers.backbone.chain import free_axes
-from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian
+from hodge_pipeline.solvers.backbone.evidence import gaussian
 from hodge_pipeline.types import Bools, Ints, ViewGraph
 
 FEWEST = 10
@@ -47,7 +46,7 @@ def fused(graph: ViewGraph, again: Bools) -> Fused:
     both = se3.covariances(graph.information[np.concatenate([first, second])][:, axes[:, None], axes])
     chi2 = gaussian(apart[:, axes], both[: len(first)] + both[len(first) :])[1]
     usual = max(float(np.median(chi2)) / len(axes), 0.0 if unknown else 1.0)
-    agree = chi2 <= usual * len(axes) * float(fdtri(len(axes), FREEDOM, 1 - 1 / len(chi2)))
+    agree = chi2 <= usual * tail_gate(len(axes), 1 / len(chi2))
     first, second, apart, information = first[agree], second[agree], apart[agree], graph.information[second[agree]]
     total, pull = graph.information.copy(), np.zeros((graph.edge_count, 6))
     np.add.at(total, first, information)

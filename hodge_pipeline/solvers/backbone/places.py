@@ -14,9 +14,10 @@ from scipy.spatial import cKDTree
 from scipy.special import gammaln, pdtrc
 
 from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.complex.judging import FREEDOM
 from hodge_pipeline.solvers.backbone.breaks import Testimony
 from hodge_pipeline.solvers.backbone.chain import loops_at_place, one_of_each_place
-from hodge_pipeline.solvers.backbone.evidence import EVEN, FREEDOM, Wrong, student
+from hodge_pipeline.solvers.backbone.evidence import EVEN, Wrong, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, settled, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, by_path, judge, left_out
 from hodge_pipeline.solvers.backbone.scales import decoys

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from hodge_pipeline.complex.judging import tail_weight
 from hodge_pipeline.solvers.backbone.chain import loops_at_place
-from hodge_pipeline.solvers.backbone.evidence import FREEDOM, gaussian
+from hodge_pipeline.solvers.backbone.evidence import gaussian
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, settled
 from hodge_pipeline.types import Floats
 
@@ -41,7 +42,7 @@ def polished(reduced: Reduced, linear: Linear) -> tuple[Linear, Floats]:
         linear, (residual, covariance) = fit.linear, fit.loops
         chi2 = gaussian(residual, covariance * weights[rows, None, None])[1]
         before = weights[rows]
-        weights[rows] = (FREEDOM + len(chain.axes)) / (FREEDOM + chi2)
+        weights[rows] = tail_weight(chi2, len(chain.axes))
         if np.abs(weights[rows] - before).max() < SAME_WEIGHT:
             break
     return linear, np.sqrt(wide / weights)

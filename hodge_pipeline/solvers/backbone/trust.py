@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import fdtri
 
-from hodge_pipeline.complex.judging import chi2_by_information, has_unit_information
+from hodge_pipeline.complex.judging import chi2_by_information, has_unit_information, tail_gate, tail_weight
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone.bridged import MOST_BREAKS, infer_bridged
 from hodge_pipeline.solvers.backbone.chain import (
@@ -19,7 +18,6 @@ from hodge_pipeline.solvers.backbone.chain import (
     one_of_each_place,
     sequential_edges,
 )
-from hodge_pipeline.solvers.backbone.evidence import FREEDOM
 from hodge_pipeline.solvers.backbone.fit import Linear
 from hodge_pipeline.solvers.backbone.inference import Inferred
 from hodge_pipeline.solvers.backbone.parallel import Fused, fused
@@ -226,7 +224,7 @@ def of_every_loop(graph: ViewGraph, backbone: Backbone, trusted: Bools) -> Backb
     """
     size, rows, weighted = len(backbone.chain.axes), np.flatnonzero(backbone.used), backbone.weighted(graph)
     rare = 1 / backbone.loops_used.sum()
-    gate = size * float(fdtri(size, FREEDOM, 1 - rare))
+    gate = tail_gate(size, rare)
     poses, weight, off = backbone.world_from_cam, np.ones(len(rows)), np.zeros(len(rows), bool)
     for _ in range(MOST_SOLVED):
         heavy_tailed = replace(weighted, information=weighted.information * weight[:, None, None])
@@ -235,7 +233,7 @@ def of_every_loop(graph: ViewGraph, backbone: Backbone, trusted: Bools) -> Backb
         before, off = off, chi2 > gate
         if (off == before).all():
             break
-        weight = np.minimum((FREEDOM + size) / (FREEDOM + chi2), 1.0)
+        weight = np.minimum(tail_weight(chi2, size), 1.0)
     used, right = backbone.used.copy(), backbone.right.copy()
     used[rows[off]], right[rows[off]] = False, rare
     return replace(backbone, used=used, right=right, world_from_cam=poses)

@@ -9,11 +9,11 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.complex.judging import (
     EXACT,
-    FREEDOM,
     MEDIAN_CHI2,
     STUDENT_99,
     chi2_by_information,
     has_unit_information,
+    tail_weight,
 )
 from hodge_pipeline.solvers.backbone.chain import (
     STEPS_OF_PLACE,
@@ -149,7 +149,7 @@ def _agreeing(chain: Chain, near: Ints) -> tuple[Floats, Floats]:
     poses = solved(weights, chain.poses)
     for _ in range(ROUNDS):
         chi2 = chi2_by_information(graph, poses) / scale
-        before, weights = weights, np.minimum((FREEDOM + size) / (FREEDOM + chi2), 1.0)
+        before, weights = weights, np.minimum(tail_weight(chi2, size), 1.0)
         if np.abs(weights - before).max() < SETTLED:
             break
         poses = solved(weights, poses)
