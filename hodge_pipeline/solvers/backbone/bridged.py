@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -103,8 +103,10 @@ def bridged(chain: Chain, broken: Break) -> Chain:
 def joined(chain: Chain) -> Chain:
     """The chain with bridges between paths, as of several robots, where loops of several places agree how they lie, or
     more of one place than are mistaken elsewhere, or one says it where hardly any are wrong.
+
+    What the loops between two paths say is kept while neither is joined, and asked anew before none is joined any more.
     """
-    learned = None
+    learned, said, as_now = None, dict[tuple[int, int], Said](), False
     while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
         poses = chain.poses
         wrong = Wrong.of(chain, poses)
@@ -116,35 +118,56 @@ def joined(chain: Chain) -> Chain:
         apart = pairs[:, 0] != pairs[:, 1]
         refuted = np.flatnonzero(~apart & (student(linear.loops[0], covariance)[0] < away))
         mistaken = [len(group) for group in agreeing_groups(told, refuted)]
-        two = np.unique(pairs[apart], axis=0)
+        two = [(low, high) for low, high in np.unique(pairs[apart], axis=0).tolist()]
+        as_now = not said
+        said = {both: said.get(both) or Said.of(told, np.flatnonzero((pairs == both).all(axis=1))) for both in two}
         odds = float(np.log(shares[0] / shares[1]))
-        best = [_joining(told, np.flatnonzero((pairs == both).all(axis=1)), mistaken, odds) for both in two]
-        at = int(np.argmax([score for score, _ in best]))
-        if best[at][0] <= 0:
+        scores = [said[both].best(mistaken, odds) for both in two]
+        (score, loop), (low, high) = max(zip(scores, two, strict=True))
+        if score > 0:
+            last, first = np.flatnonzero(chain.path == low)[-1:], np.flatnonzero(chain.path == high)[:1]
+            end, covariance = told.beyond(np.array([loop]), last, first)
+            chain = linked(chain, low, high, se3.inverse(poses[last[0]]) @ end[0], LOOSE**2 * covariance[0])
+            said = {both: each for both, each in said.items() if not {low, high} & {*both}}
+        elif as_now:
             break
-        low, high = two[at].tolist()
-        last, first = np.flatnonzero(chain.path == low)[-1:], np.flatnonzero(chain.path == high)[:1]
-        end, covariance = told.beyond(np.array([best[at][1]]), last, first)
-        chain = linked(chain, low, high, se3.inverse(poses[last[0]]) @ end[0], LOOSE**2 * covariance[0])
+        else:
+            said = {}
     return chain
 
 
-def _joining(told: Testimony, rows: Ints, mistaken: list[int], odds: float) -> tuple[float, int]:
-    """By how many nats more than enough the loops (K,) between two paths say how these lie, and the one of them that
-    says it: where others of several places agree with it, or more of one place than are mistaken, as those between the
-    paths are that contradict it and those within paths, in groups of these sizes. None that is contradicted by no other
-    is less likely than its `odds` beforehand.
+@dataclass(frozen=True)
+class Said:
+    """What the loops between two paths say of how these lie: that of them with which others of several places agree
+    most, by how many nats more than chance would; and the first loop of the largest group of one place, its size, and
+    those of the groups that contradict it.
     """
-    best = -np.inf, -1
-    for seed, factor in told.seeds(rows) if len(rows) > 1 else ():
-        score = float(told.gains(seed, rows, factor).sum()) - BY_CHANCE - float(np.log(len(told.away)))
-        best = max(best, (score, seed))
-    groups = agreeing_groups(told, rows)
-    first = np.array([group[0] for group in groups])
-    rivals = np.flatnonzero(told.factor(np.full(len(first), first[0]), first) <= 0)
-    sizes = np.array(mistaken + [len(groups[each]) for each in rivals])
-    likely = max(-_mistaken(len(groups[0]), sizes), -np.inf if len(rivals) else odds)
-    return max(best, (likely - MISTAKEN, int(first[0])))
+
+    of_places: tuple[float, int]
+    first: int
+    size: int
+    rivals: tuple[int, ...]
+
+    @classmethod
+    def of(cls, told: Testimony, rows: Ints) -> Said:
+        """That of these loops (K,)."""
+        best = -np.inf, -1
+        for seed, factor in told.seeds(rows) if len(rows) > 1 else ():
+            score = float(told.gains(seed, rows, factor).sum()) - BY_CHANCE - float(np.log(len(told.away)))
+            best = max(best, (score, seed))
+        groups = agreeing_groups(told, rows)
+        first = np.array([group[0] for group in groups])
+        against = np.flatnonzero(told.factor(np.full(len(first), first[0]), first) <= 0)
+        return cls(best, int(first[0]), len(groups[0]), tuple(len(groups[each]) for each in against))
+
+    def best(self, mistaken: list[int], odds: float) -> tuple[float, int]:
+        """The loop to join the paths by, and by how many nats it is likelier than enough: where others of several
+        places agree with it, or more of one place than should where groups of these sizes are mistaken elsewhere. None
+        that no other contradicts is less likely than its `odds` beforehand.
+        """
+        sizes = np.array([*mistaken, *self.rivals])
+        likely = max(-_mistaken(self.size, sizes), -np.inf if self.rivals else odds)
+        return max(self.of_places, (likely - MISTAKEN, self.first))
 
 
 def _mistaken(size: int, others: Ints) -> float:
