@@ -99,9 +99,20 @@ def test_one_loop_joins_sessions_where_hardly_any_is_wrong() -> None:
 
 
 def test_many_sessions_are_judged_until_no_loop_joins_them_any_more() -> None:
-    """Six rounds left 34 of 200 right loops out, .76 m from the truth."""
+    """Bridges allowed for as much as all before them together: 34 of 200 right loops were left out, .76 m off."""
     made = drive(world="town", count=2000, loops=400, wrong=0.5, seed=1)
     graph, right = in_sessions(made, 10)
     found = diagnose(graph)
-    assert not found.kept[~right].any() and (~found.kept & right).sum() <= 2
+    np.testing.assert_array_equal(found.kept, right)
     assert made.error_m(found.world_from_cam) < 0.4
+
+
+def test_frames_that_lost_their_track_are_tied_by_their_loops() -> None:
+    """Each a path of its own: 51 of 600 right loops were left out; with 45 of 10,000 nothing could be computed."""
+    made = drive(world="room", count=3000, loops=600, wrong=0.0, seed=1)
+    steps = consecutive_edges(made.graph)
+    lost = np.random.default_rng(0).choice(np.unique(made.graph.edges[~steps])[1:], 8, replace=False)
+    graph = made.graph.select(~(steps & np.isin(made.graph.edges, lost).any(axis=1)))
+    found = diagnose(graph)
+    assert found.kept.all()
+    assert made.error_m(found.world_from_cam) < 0.15

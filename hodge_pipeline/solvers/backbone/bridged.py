@@ -110,7 +110,7 @@ def joined(chain: Chain) -> Chain:
     while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
         poses = chain.poses
         wrong = Wrong.of(chain, poses)
-        scales, shares = learned = learned or learn_scales(chain, poses, wrong)
+        scales, shares = learned = learned or learn_scales(chain, wrong)
         linear, rows = linearise(scales.applied(chain), poses), np.arange(len(chain.ends))
         covariance = by_path(linear, rows)
         away = wrong.log_density(linear.chain, rows, linear.loops[0], covariance)
@@ -126,8 +126,13 @@ def joined(chain: Chain) -> Chain:
         (score, loop), (low, high) = max(zip(scores, two, strict=True))
         if score > 0:
             last, first = np.flatnonzero(chain.path == low)[-1:], np.flatnonzero(chain.path == high)[:1]
+            # of bridges on the way not even the covariance: each would allow for as much as all before it together
+            steps = np.where(chain.joins[:, None, None], 0.0, linear.chain.step_covariance)
+            told = Testimony.of(replace(linear, chain=replace(linear.chain, step_covariance=steps)), away)
             end, covariance = told.beyond(np.array([loop]), last, first)
-            chain = linked(chain, low, high, se3.inverse(poses[last[0]]) @ end[0], LOOSE**2 * covariance[0])
+            motion = se3.inverse(poses[last[0]]) @ end[0]
+            motion[:3, :3] = se3.project_to_so3(motion[:3, :3])  # else rounding doubles with each path
+            chain = linked(chain, low, high, motion, LOOSE**2 * covariance[0])
             said = {both: each for both, each in said.items() if not {low, high} & {*both}}
         elif as_now:
             break
@@ -158,7 +163,8 @@ class Said:
         groups = agreeing_groups(told, rows)
         first = np.array([group[0] for group in groups])
         against = np.flatnonzero(told.factor(np.full(len(first), first[0]), first) <= 0)
-        return cls(best, int(first[0]), len(groups[0]), tuple(len(groups[each]) for each in against))
+        size = int((told.factor(np.full(len(groups[0]), first[0]), groups[0]) > 0).sum())  # where too many, all are
+        return cls(best, int(first[0]), size, tuple(len(groups[each]) for each in against))
 
     def best(self, mistaken: list[int], odds: float) -> tuple[float, int]:
         """The loop to join the paths by, and by how many nats it is likelier than enough: where others of several

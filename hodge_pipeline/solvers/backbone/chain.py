@@ -73,6 +73,14 @@ class Chain:
         """Positions (n,) that a bridge from another path leads to."""
         return self.bridged & (self.step_edge < 0)
 
+    def parted(self) -> Chain:
+        """The chain without bridges between its paths."""
+        begins = self.step_edge < 0
+        step, covariance = self.step.copy(), self.step_covariance.copy()
+        step[begins], covariance[begins] = np.eye(4), 0.0
+        path = np.cumsum(begins) - 1
+        return replace(self, path=path, step=step, step_covariance=covariance, bridged=self.broken)
+
     @cached_property
     def poses(self) -> Floats:
         """World from each position (n, 4, 4), each path composed from the identity."""

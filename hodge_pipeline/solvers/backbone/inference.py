@@ -59,7 +59,7 @@ def infer(
     again from the places of most loops on.
     """
     poses = chain.poses
-    scales, shares = learn_scales(chain, poses, wrong) if scales is None else (scales, EVEN)
+    scales, shares = learn_scales(chain, wrong) if scales is None else (scales, EVEN)
     chain = scales.applied(chain)
     start = linearise(chain, poses)
     alone = judge(start, None, shares, wrong)

@@ -66,7 +66,7 @@ class Scales:
         return step, loop
 
 
-def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Floats]:
+def learn_scales(chain: Chain, wrong: Wrong) -> tuple[Scales, Floats]:
     """The scales at which the loops' residuals against the bare chain are likeliest, and the shares of right and wrong
     loops.
 
@@ -74,7 +74,9 @@ def learn_scales(chain: Chain, poses: Floats, wrong: Wrong) -> tuple[Scales, Flo
     Decoys, motions of loops between other places, tell what as many would explain by chance at each scale. Of loops
     between two paths, which may be joined, each is held against the one beside it.
     """
-    chain = replace(chain, path=np.cumsum(chain.step_edge < 0) - 1, bridged=chain.broken)  # as before they were joined
+    if chain.joins.any():  # as before, since beside what bridges allow for rounding hides how little steps err
+        chain = chain.parted()
+    poses = chain.poses
     alone = _learned_from(chain.path, np.arange(len(chain.ends)), chain.ends)
     of_decoys = _learned_from(chain.path, *decoys(chain, DECOYS))
     rows, ends = (np.concatenate(each) for each in zip(alone, of_decoys, strict=True))
