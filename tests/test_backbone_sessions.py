@@ -56,13 +56,15 @@ def test_sessions_that_share_one_street_are_joined_where_no_place_is_mistaken_as
     np.testing.assert_array_equal(diagnose(graph).kept, right)
 
 
-@pytest.mark.parametrize(("groups", "size"), [(2, 30), (3, 12), (40, 1)])
-def test_wrong_loops_between_sessions_join_nothing(groups: int, size: int) -> None:
-    """As many of one place as contradict them say nothing, whatever single wrong loops lie within the sessions."""
-    made = drive(world="room", count=600, loops=120, wrong=0.5, seed=1)
+@pytest.mark.parametrize(("world", "groups", "size"), [("room", 2, 30), ("room", 3, 12), ("ring", 40, 1)])
+def test_wrong_loops_between_sessions_join_nothing(world: str, groups: int, size: int) -> None:
+    """As many of one place as contradict them say nothing, whatever single wrong loops lie within the sessions; nor
+    does one of 40 that chance lets others agree with, though they do not count: nothing tests it.
+    """
+    made = drive(world=world, count=600, loops=120, wrong=0.5, seed=1)
     within = np.equal(*(made.graph.edges >= CUT).T)
     graph, right = made.graph.select(within), made.right[within]
-    rng, edges, motions = np.random.default_rng(1), [], []
+    rng, edges, motions = np.random.default_rng(2), [], []
     for _ in range(groups):
         pairs = rng.integers([0, CUT], [CUT - size, 600 - size]) + np.arange(size)[:, None]
         off = se3.exp(np.array([[0, 0, rng.normal(0, 0.4), *rng.normal(0, 3, 2), 0]]))[0]
@@ -76,17 +78,6 @@ def test_wrong_loops_between_sessions_join_nothing(groups: int, size: int) -> No
     np.testing.assert_array_equal(found.kept, np.append(right, np.zeros(groups * size, bool)))
 
 
-def test_a_session_that_one_loop_alone_ties_stays_apart() -> None:
-    """Nothing tests the loop: random ones joined the last session where few right loops lead to it."""
-    made = drive(world="ring", count=600, loops=120, wrong=0.8, seed=1)
-    graph, right = in_sessions(made, 5)
-    found = diagnose(graph)
-    assert not found.kept[~right].any()
-    session = graph.edges // 120
-    across = found.kept & (session[:, 0] != session[:, 1])
-    assert all(np.bincount(session[across].ravel(), minlength=5) != 1)
-
-
 def test_one_loop_joins_sessions_where_hardly_any_is_wrong() -> None:
     """A right link that alone held a graph together was left out, which came back in pieces."""
     made = drive(world="ring", count=600, loops=120, wrong=0.0, seed=1)
@@ -98,7 +89,7 @@ def test_one_loop_joins_sessions_where_hardly_any_is_wrong() -> None:
     assert made.error_m(found.world_from_cam) < 2.0
 
 
-def test_many_sessions_are_judged_until_no_loop_joins_them_any_more() -> None:
+def test_loops_of_many_sessions_count() -> None:
     """Bridges allowed for as much as all before them together: 34 of 200 right loops were left out, .76 m off."""
     made = drive(world="town", count=2000, loops=400, wrong=0.5, seed=1)
     graph, right = in_sessions(made, 10)

@@ -106,7 +106,7 @@ def joined(chain: Chain) -> Chain:
 
     What the loops between two paths say is kept while neither is joined, and asked anew before none is joined any more.
     """
-    learned, said, as_now = None, dict[tuple[int, int], Said](), False
+    learned, said = None, dict[tuple[int, int], Said]()
     while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
         poses = chain.poses
         wrong = Wrong.of(chain, poses)

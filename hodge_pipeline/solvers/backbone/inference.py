@@ -18,8 +18,7 @@ from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales
 from hodge_pipeline.solvers.resistance import Network, effective_resistance
 from hodge_pipeline.types import Bools, Floats
 
-ROUNDS, MOST_ROUNDS = 6, 12
-"""In which loops are judged anew, the latter while each makes them likelier: sessions with few loops settle slowly."""
+ROUNDS = 6
 
 
 @dataclass(frozen=True)
@@ -169,7 +168,7 @@ def _agreed(
     chain, limit = start.chain, np.log(max(len(always), 1)) if not begun else 0.0
     ends = chain.places
     best, top, seen = (alone, start), -np.inf, b""
-    for number in range(begun, MOST_ROUNDS + begun):
+    for number in range(begun, ROUNDS + begun):
         rows = np.flatnonzero(used)
         if number < SETTLING and len(rows):  # later: a group that is mistaken vouches for itself
             rows = rows[one_of_each_place(ends[rows])]
@@ -187,8 +186,6 @@ def _agreed(
         likelihood -= float(judged.log_density[1].sum())
         if number >= SETTLING and likelihood > top:
             best, top = (judged, linear), likelihood
-        elif number + 1 >= ROUNDS + begun:
-            break
         limit = limit / 2 if number < SETTLING else 0.0
         used = (judged.log_odds > limit) & (judged.factor > limit) | always
         if number >= SETTLING and np.packbits(used).tobytes() == seen:

@@ -77,8 +77,8 @@ def learn_scales(chain: Chain, wrong: Wrong) -> tuple[Scales, Floats]:
     if chain.joins.any():  # as before, since beside what bridges allow for rounding hides how little steps err
         chain = chain.parted()
     poses = chain.poses
-    alone = _learned_from(chain.path, np.arange(len(chain.ends)), chain.ends)
-    of_decoys = _learned_from(chain.path, *decoys(chain, DECOYS))
+    alone = _within(chain, np.arange(len(chain.ends)), chain.ends)
+    of_decoys = _within(chain, *decoys(chain, DECOYS))
     rows, ends = (np.concatenate(each) for each in zip(alone, of_decoys, strict=True))
     models = _Model.within(chain.with_loops(rows, ends), poses, wrong)
     own, elsewhere = models.select(slice(len(alone[0]))), models.select(slice(len(alone[0]), None))
@@ -119,9 +119,7 @@ def _beyond_chance(logs: Floats, own: _Model, elsewhere: _Model) -> float:
 def _neighbours(chain: Chain) -> tuple[Ints, Ints]:
     """Loops (K,) between two paths, and for each that loop between them whose ends are nearest to its own."""
     pairs = chain.path[chain.ends]
-    rows = np.flatnonzero(pairs[:, 0] != pairs[:, 1])
-    if len(rows) > MOST_LOOPS:
-        rows = np.sort(np.random.default_rng(0).choice(rows, MOST_LOOPS, replace=False))
+    rows = _some(np.flatnonzero(np.not_equal(*pairs.T)))
     if len(rows) < 2:
         return rows[:0], rows[:0]
     near = cKDTree(chain.ends[rows]).query(chain.ends[rows], k=2, p=np.inf)[1]
@@ -175,12 +173,16 @@ def decoys(chain: Chain, times: int) -> tuple[Ints, Ints]:
     return loop, np.sort(np.stack([first, second], axis=1), axis=1)
 
 
-def _learned_from(path: Ints, loop: Ints, ends: Ints) -> tuple[Ints, Ints]:
+def _within(chain: Chain, loop: Ints, ends: Ints) -> tuple[Ints, Ints]:
     """Those of the loops within a path and their ends that scales are learned from."""
-    rows = np.flatnonzero(path[ends[:, 0]] == path[ends[:, 1]])
-    if len(rows) > MOST_LOOPS:
-        rows = np.sort(np.random.default_rng(0).choice(rows, MOST_LOOPS, replace=False))
+    rows = _some(np.flatnonzero(np.equal(*chain.path[ends].T)))
     return loop[rows], ends[rows]
+
+
+def _some(rows: Ints) -> Ints:
+    return (
+        rows if len(rows) <= MOST_LOOPS else np.sort(np.random.default_rng(0).choice(rows, MOST_LOOPS, replace=False))
+    )
 
 
 @dataclass(frozen=True)
