@@ -7,6 +7,7 @@ import pytest
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.result import UNTESTABLE
 from hodge_pipeline.solvers.backbone.chain import consecutive_edges
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Bools, ViewGraph
@@ -76,6 +77,7 @@ def test_wrong_loops_between_sessions_join_nothing(world: str, groups: int, size
     more = ViewGraph.from_edges(graph.vertex_ids, np.concatenate(edges), np.concatenate(motions), known, dimension=2)
     found = diagnose(ViewGraph.joined([graph, more]))
     np.testing.assert_array_equal(found.kept, np.append(right, np.zeros(groups * size, bool)))
+    assert (found.verdict[-groups * size :] == UNTESTABLE).all()
 
 
 def test_one_loop_joins_sessions_where_hardly_any_is_wrong() -> None:

@@ -150,6 +150,16 @@ def test_where_information_is_unknown_steps_err_as_they_close() -> None:
     assert made.error_m(found.world_from_cam) < 0.1 * made.error_m(made.odometry())
 
 
+def test_edges_between_two_sequences_are_no_window() -> None:
+    """In a graph of twenty vertices each was near, and took the place of the steps."""
+    made, _ = with_window(drive(count=20, wrong=0.0, loops=0), 3)
+    apart = np.equal(*(made.graph.edges >= 10).T)
+    across = np.flatnonzero(~apart & (np.abs(np.diff(made.graph.edges, axis=1)[:, 0]) > 1))
+    graph = made.graph.select(np.concatenate([np.flatnonzero(apart), across]))
+    found = windowed(whole(graph))
+    assert set(range(graph.edge_count - len(across), graph.edge_count)) <= set(found.rows.tolist())
+
+
 @pytest.mark.parametrize("stated", [True, False])
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e6])
 def test_an_exact_window_in_any_unit_is_one(stated: bool, unit: float) -> None:

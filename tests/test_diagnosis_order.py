@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -51,6 +53,17 @@ def test_the_order_counts_where_every_pair_is_joined() -> None:
     assert prior[gap == 1].min() > 0.9 and prior[gap > 8].max() < 0.2
     shuffled = np.random.default_rng(0).permutation(24)[pairs]
     assert np.ptp(prior_by_cycles(shuffled, 24, found.cycles)) == 0
+
+
+def test_the_order_is_that_of_the_ids_and_not_of_the_rows() -> None:
+    """A file may list its frames in any order: half of the edges kept were wrong ones."""
+    graph, _, _ = every_pair_tried(0)
+    order = np.random.default_rng(0).permutation(graph.vertex_count)
+    shuffled = replace(graph, vertex_ids=graph.vertex_ids[order], edges=np.argsort(order)[graph.edges])
+    found, expected = diagnose(shuffled), diagnose(graph)
+    np.testing.assert_array_equal(found.verdict, expected.verdict)
+    np.testing.assert_array_equal(found.probability, expected.probability)
+    np.testing.assert_allclose(found.world_from_cam, expected.world_from_cam[order], atol=1e-9)
 
 
 def test_a_wrong_step_between_consecutive_views_does_not_outvote_the_loops() -> None:

@@ -31,10 +31,11 @@ from hodge_pipeline.diagnosis.shared_blame import share_blame
 from hodge_pipeline.diagnosis.wording import reasons
 from hodge_pipeline.one_blas_thread import one_blas_thread
 from hodge_pipeline.solvers.backbone.anyway import backbone_anyway
+from hodge_pipeline.solvers.backbone.chain import vertex_ranks
 from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
 from hodge_pipeline.solvers.resistance import Network
 from hodge_pipeline.solvers.weights import OUT_OF_PLANE, is_planar
-from hodge_pipeline.types import Bools, Floats, ViewGraph
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 DEFAULTS = DiagnosisOptions()
 LIKELIER_RIGHT = 0.5
@@ -58,7 +59,7 @@ def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbo
     """The backbone of a graph that has one, else the diagnosis that trusts no edge, as of a room of which every pair of
     views was tried.
     """
-    if options.trust == AUTO and every_pair_tried(graph.edges, graph.vertex_count):
+    if options.trust == AUTO and every_pair_tried(vertex_ranks(graph)[graph.edges], graph.vertex_count):
         return _ByCycles.of(graph, options).found
     backbone = find_backbone(graph, options.trust)
     if backbone is not None and not backbone.doubted:
@@ -78,7 +79,8 @@ def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbo
 @dataclass(frozen=True)
 class _ByCycles:
     """What the cycles of a graph say, and the solution that most edges agree with, at the working point, whose frames
-    are `there (4, 4)` in those of the graph; edges that were `turned (E,)`.
+    are `there (4, 4)` in those of the graph; edges that were `turned (E,)`. Its vertices stand in the order of their
+    ids, each at its `rank (V,)`, since poses drift along it.
     """
 
     stated: ViewGraph
@@ -86,14 +88,16 @@ class _ByCycles:
     evidence: Evidence
     cycles: Cycles
     there: Floats
+    rank: Ints
 
     @classmethod
     def of(cls, stated: ViewGraph, options: DiagnosisOptions) -> _ByCycles:
         """What they say of this graph."""
-        graph, turned = in_vertex_order(stated)
+        rank = vertex_ranks(stated)
+        graph, turned = in_vertex_order(replace(stated, edges=rank[stated.edges]))
         evidence, cycles, point = gather(graph, options)
         there = se3.from_parts(np.eye(3), point)
-        return cls(stated, turned, evidence, cycles, there)
+        return cls(stated, turned, evidence, cycles, there, rank)
 
     @property
     def by_chance(self) -> bool:
@@ -113,7 +117,8 @@ class _ByCycles:
 
     def sought_from(self, world_from_cam: Floats) -> Diagnosis:
         """The same with the solution sought from these poses (V, 4, 4) too."""
-        return self._diagnosis(sought_from(self.evidence, self.fit, world_from_cam @ self.there))
+        in_order = world_from_cam[np.argsort(self.rank)] @ self.there
+        return self._diagnosis(sought_from(self.evidence, self.fit, in_order))
 
     def _diagnosis(self, fit: Fit) -> Diagnosis:
         stated, evidence, there = self.stated, self.evidence, self.there
@@ -128,7 +133,7 @@ class _ByCycles:
         wrong = probability < WRONG_BELOW
         verdict = np.select([untestable, right, wrong], [UNTESTABLE, CONSISTENT, WRONG], SUSPECT)
         kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
-        world_from_cam = fit.poses @ se3.inverse(there)
+        world_from_cam = fit.poses[self.rank] @ se3.inverse(there)
         cycles = replace(cycles, loops=cycles.loops.reversed_edges(self.turned))
         telling = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
         found = Diagnosis.of(
@@ -138,7 +143,6 @@ class _ByCycles:
             reasons=partial(reasons, stated, cycles, verdict, telling, undecided, fit.bridge),
             kept=kept,
             network=Network.of(stated.edges[kept], stated.vertex_count),
-            resistance=fit.resistance,
             cycles=cycles,
             witnesses=telling,
             world_from_cam=world_from_cam,

@@ -23,7 +23,7 @@ from hodge_pipeline.diagnosis.result import (
 from hodge_pipeline.diagnosis.wording import distance
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.trust import Backbone
-from hodge_pipeline.solvers.resistance import Network, effective_resistance
+from hodge_pipeline.solvers.resistance import Network
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 MOST_ENTRIES = 500_000
@@ -39,14 +39,15 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone) -> Diagnosis:
     kept = backbone.used
     in_loop = np.zeros(graph.edge_count, bool)
     in_loop[np.flatnonzero(kept)] = series_classes(graph.edges[kept], graph.vertex_count) >= 0
-    probability = np.where(backbone.steps, np.where(in_loop, RIGHT_STEP, np.nan), backbone.right)
+    network = Network.of(graph.edges[kept], graph.vertex_count)
+    tested = np.where(backbone.steps, in_loop, np.equal(*network.component[graph.edges.T]))
+    probability = np.where(tested, np.where(backbone.steps, RIGHT_STEP, backbone.right), np.nan)
     refuted = backbone.steps & ~kept | backbone.contradicted
     probability[refuted] = 1 - RIGHT_STEP
     untestable = np.isnan(probability)
     wrong = ~kept & (probability < WRONG_BELOW) & (refuted | backbone.found.confirmed)
     verdict = np.select([untestable, wrong, kept], [UNTESTABLE, WRONG, CONSISTENT], SUSPECT)
     cycles, cycle = _cycles(graph, backbone, in_loop)
-    network = Network.of(graph.edges[kept], graph.vertex_count)
     return Diagnosis.of(
         graph,
         verdict=verdict,
@@ -54,7 +55,6 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone) -> Diagnosis:
         reasons=partial(_reasons, graph.edges, backbone, verdict),
         kept=kept,
         network=network,
-        resistance=effective_resistance(graph.edges, kept, network),
         cycles=cycles,
         witnesses=(_witnesses(np.where(kept, cycle, -1)), _witnesses(np.where(kept, -1, cycle))),
         world_from_cam=backbone.world_from_cam,
@@ -118,6 +118,8 @@ def _reasons(
             lines.append(f"an edge of the backbone that {over[edge]} confirmed loops over it contradict: {away}")
         elif backbone.used[edge]:
             lines.append(f"it agrees with the backbone and {others - 1} other loops: {away}")
+        elif name == UNTESTABLE and edges[edge, 0] == edges[edge, 1]:
+            lines.append("it joins a vertex to itself: it says nothing of the others")
         elif name == UNTESTABLE:
             lines.append("it joins two paths of the backbone that nothing else joins: nothing can test it")
         elif not others:

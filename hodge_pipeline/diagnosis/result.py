@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.diagnosis.cycles import Cycles
 from hodge_pipeline.evaluation.residuals import edge_residuals
-from hodge_pipeline.solvers.resistance import Network
+from hodge_pipeline.solvers.resistance import Network, effective_resistance
 from hodge_pipeline.types import Bools, Edges, Floats, Ints, ViewGraph
 
 CONSISTENT, SUSPECT, WRONG, UNTESTABLE = "consistent", "suspect", "wrong", "untestable"
@@ -61,20 +61,19 @@ class Diagnosis:
         reasons: Callable[[tuple[Floats, Floats]], tuple[str, ...]],
         kept: Bools,
         network: Network,
-        resistance: Floats,
         cycles: Cycles,
         witnesses: tuple[Ints, Ints],
         world_from_cam: Floats,
         tested: str,
     ) -> Diagnosis:
         """The diagnosis of these verdicts: its pieces are those of the kept edges; `reasons` of the residuals (E,) in
-        metres and degrees; `resistance (E,)` as of `effective_resistance`; `tested`: a note on what tested the edges.
+        metres and degrees; `tested`: a note on what tested the edges.
         """
         piece = network.component
         apart = piece[graph.edges[:, 0]] != piece[graph.edges[:, 1]]
         displacement_m, angle = edge_residuals(graph, world_from_cam)
         residual = np.where(apart, np.nan, displacement_m), np.where(apart, np.nan, np.degrees(angle))
-        leverage = np.where(kept, 1 - 1 / (1 + resistance), 0.0)
+        leverage = np.where(kept, 1 - 1 / (1 + effective_resistance(graph.edges, kept, network)), 0.0)
         notes = f"edges: {count_verdicts(verdict)}", tested, *describe_components(piece, graph.vertex_ids)
         told = verdict, probability, reasons(residual), kept, *residual, leverage, graph.information, cycles
         return cls(*told, *witnesses, network.component, world_from_cam, network, notes)

@@ -10,12 +10,12 @@ from scipy.sparse import csr_matrix
 
 from hodge_pipeline.complex.coboundary import coboundary_0, grounded_laplacian
 from hodge_pipeline.complex.components import connected_components, first_of_component
+from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.solvers.linear import Factor, factorise
 from hodge_pipeline.types import Bools, Floats, Ints
 
-EXACT_TO = 1500
-SKETCHES = 24
-BRIDGE = 1e-3
+EXACT_TO, SKETCHES = 1500, 24
+"""Vertices up to which resistances are exact, and projections beyond: limits on cost."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,11 @@ class Network:
         """Of their Laplacian without the grounded vertices."""
         return factorise(grounded_laplacian(self.d0, np.ones(self.d0.shape[0]), self.grounded))
 
+    @property
+    def is_exact(self) -> bool:
+        """Whether resistances are more than estimates."""
+        return len(self.grounded) <= EXACT_TO
+
     def between(self, pairs: Ints) -> Floats:
         """The resistance (P,) of each pair: the variance of its relative pose in units of an edge's. ∞ where no path
         joins the two.
@@ -49,7 +54,7 @@ class Network:
         so.
         """
         i, j = pairs.T
-        through = self._exact(i, j) if len(self.grounded) <= EXACT_TO else self._sketched(i, j)
+        through = self._exact(i, j) if self.is_exact else self._sketched(i, j)
         return np.where(self.component[i] == self.component[j], through, np.inf)
 
     def potentials(self, i: int, j: int) -> Floats:
@@ -75,8 +80,9 @@ class Network:
 
 def effective_resistance(edges: Ints, used: Bools, network: Network) -> Floats:
     """The resistance (E,) between the ends of each edge through the other ones that are used, whose network it is."""
-    own = used & (edges[:, 0] != edges[:, 1])
-    through = network.between(edges)
-    rest = np.maximum(1 - through, 0.0)
-    without = np.where(rest > BRIDGE, through / np.where(rest > BRIDGE, rest, 1.0), np.inf)
-    return np.where(own, without, through)
+    own = np.flatnonzero(used & (edges[:, 0] != edges[:, 1]))
+    out = network.between(edges)
+    rest = np.maximum(1 - out[own], np.finfo(float).eps if network.is_exact else np.sqrt(2 / SKETCHES))
+    bridge = series_classes(edges[own], len(network.component)) < 0
+    out[own] = np.where(bridge, np.inf, out[own] / rest)
+    return out

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from hodge_pipeline import se3
 from hodge_pipeline.complex.judging import FREEDOM, tail_weight
 from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place
-from hodge_pipeline.solvers.backbone.evidence import gaussian, student
+from hodge_pipeline.solvers.backbone.evidence import squares, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, root, shifted, without_run
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -173,11 +173,11 @@ class Usual:
         for _ in range(ROUNDS):
             covariance = (left * weight[:, None]).T @ left / len(left)
             covariance += np.diag(LEAST * np.diag(covariance) + np.finfo(float).tiny ** 0.5)
-            chi2 = gaussian(left, np.broadcast_to(covariance, (len(left), *covariance.shape)))[1]
+            chi2 = squares(left, np.broadcast_to(covariance, (len(left), *covariance.shape)))[0]
             weight = tail_weight(chi2, left.shape[1])
-        centres, shares, of_one = _kinds(left, chi2, covariance)
-        white = np.linalg.inv(root(covariance[None])[0])
-        chi2 = np.min([(((left - centre) @ white.T) ** 2).sum(axis=1) for centre in centres], axis=0)
+        whiten = np.linalg.inv(root(covariance[None])[0]).T
+        centres, shares, of_one = _kinds(left, left @ whiten)
+        chi2 = cKDTree(centres @ whiten).query(left @ whiten)[0] ** 2
         size = np.log(np.maximum(chi2[: len(rows)], np.finfo(float).tiny)) / 2
         floor = np.quantile(size, 1 - TAIL)
         mean = float(np.mean(size[size > floor] - floor)) if (size > floor).any() else np.inf
@@ -200,11 +200,10 @@ def _mirrored(chain: Chain, twist: Floats) -> Floats:
     return np.asarray(np.kron(np.eye(2), half)[np.ix_(chain.axes, chain.axes)], float)
 
 
-def _kinds(left: Floats, chi2: Floats, covariance: Floats) -> tuple[Floats, Floats, Bools]:
+def _kinds(left: Floats, white: Floats) -> tuple[Floats, Floats, Bools]:
     """The centres (K, p) of kinds of steps, the share of the steps that are of each, and which steps are of one."""
-    size = left.shape[1]
-    white, gate = left @ np.linalg.inv(root(covariance[None])[0]).T, ALIKE * size
-    other = chi2 > gate
+    size, gate = left.shape[1], ALIKE * left.shape[1]
+    other = (white**2).sum(axis=1) > gate
     centres, counts = [np.zeros(size)], [max(float((~other).sum()), 1.0)]
     while other.sum() >= FEWEST_ALIKE and len(centres) < MOST_KINDS:
         rows = np.flatnonzero(other)
@@ -262,7 +261,7 @@ def _break(told: Testimony, usual: Usual, loop: int, at: Ints, score: Floats) ->
     off = usual.off(told.chain, se3.inverse(told.linear.poses[one - 1]) @ end)[:, 0]
     whole = np.broadcast_to(covariance[0] + usual.covariance, (len(off), *covariance.shape[1:]))
     kind = int(np.argmax(np.log(usual.shares) + student(off, whole)[0]))
-    chi2 = gaussian(off, whole)[1][kind]
+    chi2 = squares(off, whole)[0][kind]
     wide = usual.covariance * max(1.0, 1 / float(tail_weight(chi2, off.shape[1])))
     towards = wide @ np.linalg.solve(wide + covariance[0], off[kind])
     return Break(int(one[0]), usual.centres[kind] @ told.chain.exp(towards), wide, float(score[row]))

@@ -147,10 +147,14 @@ def consecutive_edges(graph: ViewGraph) -> Bools:
 
 def steps_apart(graph: ViewGraph) -> Ints:
     """How far apart the vertices of each edge (E,) lie in the order of their ids."""
-    ranks = graph.edges
+    return np.asarray(np.abs(np.diff(vertex_ranks(graph)[graph.edges], axis=1)[:, 0]))
+
+
+def vertex_ranks(graph: ViewGraph) -> Ints:
+    """The place (V,) of each vertex in the order of the ids where these are numbers, else of the rows."""
     if graph.vertex_ids.dtype.kind in "iu":
-        ranks = np.argsort(np.argsort(graph.vertex_ids, kind="stable"), kind="stable")[ranks]
-    return np.asarray(np.abs(ranks[:, 0] - ranks[:, 1]))
+        return np.argsort(np.argsort(graph.vertex_ids, kind="stable"), kind="stable")
+    return np.arange(graph.vertex_count)
 
 
 def sequential_edges(graph: ViewGraph) -> Bools:

@@ -51,10 +51,9 @@ class Wrong:
         octave[apart] = len(self.spread) - 1
         along = np.swapaxes(self.axes, 1, 2)[octave]
         shape = np.maximum(self.spread[octave], ((along @ covariance) * along).sum(axis=2))
-        squares = ((along @ residual[:, :, None])[..., 0] ** 2 / shape).sum(axis=1)
-        squares[apart] = size  # how two paths lie is not known
-        norm = gammaln((1 + size) / 2) - gammaln(0.5) - 0.5 * size * np.log(np.pi)
-        return np.asarray(norm - 0.5 * np.log(shape).sum(axis=1) - 0.5 * (1 + size) * np.log1p(squares))
+        chi2 = ((along @ residual[:, :, None])[..., 0] ** 2 / shape).sum(axis=1)
+        chi2[apart] = size  # how two paths lie is not known
+        return np.asarray(log_student(chi2, size, freedom=1.0) - 0.5 * np.log(shape).sum(axis=1))
 
 
 def _on_one_path(chain: Chain, pairs: Ints) -> Bools:
@@ -84,23 +83,27 @@ def parallel(chain: Chain, motion: Floats, from_a: Floats, from_b: Floats) -> Fl
     return np.asarray(np.einsum("nij,nkj->nki", from_b[:, :3, :3], left).reshape(-1, 6)[:, chain.axes])
 
 
-def gaussian(residual: Floats, covariance: Floats) -> tuple[Floats, Floats]:
-    """The log-density (M,) and χ² (M,) of residuals (M, p) with covariances (M, p, p)."""
+def squares(residual: Floats, covariance: Floats) -> tuple[Floats, Floats]:
+    """χ² (M,) of residuals (M, p) with covariances (M, p, p), and half the logarithms (M,) of their determinants."""
     factor, white = root(covariance), np.empty_like(residual)
     for row in range(residual.shape[1]):  # by substitution, for all at once
         above = np.einsum("mk,mk->m", factor[:, row, :row], white[:, :row])
         white[:, row] = (residual[:, row] - above) / factor[:, row, row]
-    chi2 = np.einsum("mi,mi->m", white, white)
-    half_log = np.log(np.einsum("mii->mi", factor)).sum(axis=1) + 0.5 * residual.shape[1] * np.log(2 * np.pi)
-    return -0.5 * chi2 - half_log, chi2
+    return np.einsum("mi,mi->m", white, white), np.log(np.einsum("mii->mi", factor)).sum(axis=1)
 
 
 def student(residual: Floats, covariance: Floats) -> tuple[Floats, Floats]:
     """The log-density (M,) of Student's distribution, and χ² (M,), of residuals (M, p) with shapes (M, p, p)."""
-    log_density, chi2 = gaussian(residual, covariance)
-    size = residual.shape[1]
-    norm = gammaln((FREEDOM + size) / 2) - gammaln(FREEDOM / 2) - 0.5 * size * np.log(FREEDOM / 2)
-    return log_density + 0.5 * chi2 + norm - 0.5 * (FREEDOM + size) * np.log1p(chi2 / FREEDOM), chi2
+    chi2, half_log_det = squares(residual, covariance)
+    return log_student(chi2, residual.shape[1]) - half_log_det, chi2
+
+
+def log_student(chi2: Floats | float, size: int, freedom: float = FREEDOM) -> Floats:
+    """The log-density of Student's distribution in so many dimensions, in units of its shape's roots: with a freedom of
+    one that of Cauchy's.
+    """
+    norm = gammaln((freedom + size) / 2) - gammaln(freedom / 2) - 0.5 * size * np.log(freedom * np.pi)
+    return np.asarray(norm - 0.5 * (freedom + size) * np.log1p(np.asarray(chi2) / freedom))
 
 
 EVEN, LEAST_SHARE = np.full(2, 0.5), 1e-3

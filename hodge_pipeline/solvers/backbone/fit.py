@@ -305,7 +305,7 @@ class Fit:
         return out
 
 
-LEAST_WON, HALVINGS = 0.01, 4
+LEAST_WON, HALVINGS = 0.01, 10
 """Of χ²: a step that wins less moves nothing by more than a tenth of its standard deviation."""
 TORN, SHARE_WON = 10.0, 1e-4
 """χ² to a number that loops state, from where on these contradict each other, and the share of it that a step must win

@@ -26,15 +26,12 @@ class Judged:
     log_density: Floats
 
 
-def judge(linear: Linear, fit: Fit | None, shares: Floats, wrong: Wrong, tense: bool = False) -> Judged:
-    """The loops at a fit, or at the bare chain; `tense`: with errors by which half of those in the fit are usual."""
+def judge(linear: Linear, fit: Fit | None, shares: Floats, wrong: Wrong) -> Judged:
+    """The loops at a fit, or at the bare chain."""
     covariance, residual = uncertainty(linear, fit), linear.loops[0].copy()
     if fit is not None and len(fit.reduced.active):
         residual[fit.reduced.active], covariance[fit.reduced.active] = left_out(fit)
     known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
-    if tense and fit is not None and len(fit.reduced.active):
-        usual = student(residual[fit.reduced.active], covariance[fit.reduced.active])[1]
-        covariance = covariance * max(1.0, float(np.median(usual)) / len(linear.chain.axes))
     log_density = np.zeros((2, len(covariance)))
     chi2 = np.full(len(covariance), np.nan)
     log_density[0, known], chi2[known] = student(residual[known], covariance[known])

@@ -9,7 +9,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.complex.judging import has_unit_information, in_vertex_order, tail_gate
 from hodge_pipeline.solvers.backbone.chain import free_axes
-from hodge_pipeline.solvers.backbone.evidence import gaussian
+from hodge_pipeline.solvers.backbone.evidence import squares
 from hodge_pipeline.types import Bools, Ints, ViewGraph
 
 FEWEST = 10
@@ -44,8 +44,8 @@ def fused(graph: ViewGraph, again: Bools) -> Fused:
     axes, unknown, graph = free_axes(graph), has_unit_information(graph), in_vertex_order(graph)[0]
     apart = se3.log(se3.inverse(graph.i_from_j[first]) @ graph.i_from_j[second])
     both = se3.covariances(graph.information[np.concatenate([first, second])][:, axes[:, None], axes])
-    chi2 = gaussian(apart[:, axes], both[: len(first)] + both[len(first) :])[1]
-    usual = max(float(np.median(chi2)) / len(axes), 0.0 if unknown else 1.0)
+    chi2 = squares(apart[:, axes], both[: len(first)] + both[len(first) :])[0]
+    usual = max(float(np.median(chi2)) / len(axes), np.finfo(float).eps if unknown else 1.0)
     agree = chi2 <= usual * tail_gate(len(axes), 1 / len(chi2))
     first, second, apart, information = first[agree], second[agree], apart[agree], graph.information[second[agree]]
     total, pull = graph.information.copy(), np.zeros((graph.edge_count, 6))

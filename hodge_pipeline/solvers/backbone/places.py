@@ -11,13 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.special import gammaln, pdtrc
+from scipy.special import pdtrc
 
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.judging import FREEDOM
 from hodge_pipeline.solvers.backbone.breaks import Testimony
 from hodge_pipeline.solvers.backbone.chain import loops_at_place, one_of_each_place
-from hodge_pipeline.solvers.backbone.evidence import EVEN, Wrong, student
+from hodge_pipeline.solvers.backbone.evidence import EVEN, Wrong, log_student, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, settled, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, by_path, judge, left_out
 from hodge_pipeline.solvers.backbone.scales import decoys
@@ -148,9 +147,11 @@ class Places:
         return Arrangement(right, fit, self._density(fit) + prior)
 
     def _density(self, fit: Fit) -> float:
-        """The log-density of the active loops together, against all of them being wrong."""
+        """The log-density of the active loops together, against all of them being wrong: of all in one Student's
+        distribution, since all errors may be larger than they are thought to be by one factor.
+        """
         count = fit.reduced.active.size * len(self.start.chain.axes)
-        return float(_log_student(fit.cost, count) - 0.5 * fit.log_det - self._away(fit).sum())
+        return float(log_student(fit.cost, count) - 0.5 * fit.log_det - self._away(fit).sum())
 
     def _away(self, fit: Fit) -> Floats:
         """The log-density (L,) of each active loop if it is wrong."""
@@ -173,7 +174,7 @@ class Places:
         right = strongest = np.arange(len(self.loop)) == np.argmax(by_itself)
         for _ in range(ROUNDS):
             fit = settled(Fit(thinned(self.start.chain, self.loop[right]), self.start), MOST_STEPS)
-            factor = judge(fit.linear, fit, EVEN, self.wrong, tense=True).factor[self.loop] - self.rivals(right)
+            factor = judge(fit.linear, fit, EVEN, self.wrong).factor[self.loop] - self.rivals(right)
             before, right = right, (self.used & (factor > enough)) | strongest
             if (before == right).all():
                 break
@@ -216,14 +217,6 @@ def _cut(run: Ints, ends: Floats) -> Ints:
         part[rows] = after + np.unique(at, return_inverse=True)[1]
         after = int(part[rows].max()) + 1
     return part
-
-
-def _log_student(chi2: Floats | float, count: int) -> Floats:
-    """The log-density of so many numbers of this χ² in units of their covariances' roots: by Student's distribution of
-    all together, since all errors may be larger than they are thought to be by one factor.
-    """
-    norm = gammaln((FREEDOM + count) / 2) - gammaln(FREEDOM / 2) - 0.5 * count * np.log(FREEDOM * np.pi)
-    return np.asarray(norm - 0.5 * (FREEDOM + count) * np.log1p(np.asarray(chi2) / FREEDOM))
 
 
 def agreeing_groups(told: Testimony, rows: Ints) -> list[Ints]:

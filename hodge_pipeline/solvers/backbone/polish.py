@@ -8,7 +8,7 @@ import numpy as np
 
 from hodge_pipeline.complex.judging import tail_weight
 from hodge_pipeline.solvers.backbone.chain import loops_at_place
-from hodge_pipeline.solvers.backbone.evidence import gaussian
+from hodge_pipeline.solvers.backbone.evidence import squares
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, settled
 from hodge_pipeline.types import Floats
 
@@ -40,7 +40,7 @@ def polished(reduced: Reduced, linear: Linear) -> tuple[Linear, Floats]:
         weighted = replace(chain, covariance=chain.covariance / weights[:, None, None])
         fit = settled(Fit(reduced, replace(linear, chain=weighted)), STEPS)
         linear, (residual, covariance) = fit.linear, fit.loops
-        chi2 = gaussian(residual, covariance * weights[rows, None, None])[1]
+        chi2 = squares(residual, covariance * weights[rows, None, None])[0]
         before = weights[rows]
         weights[rows] = tail_weight(chi2, len(chain.axes))
         if np.abs(weights[rows] - before).max() < SAME_WEIGHT:

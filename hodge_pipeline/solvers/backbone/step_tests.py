@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
-from hodge_pipeline.solvers.backbone.chain import Chain, linear_forest, make_chain, sequential_edges
-from hodge_pipeline.solvers.backbone.evidence import gaussian
+from hodge_pipeline.solvers.backbone.chain import Chain, make_chain, sequential_edges
+from hodge_pipeline.solvers.backbone.evidence import squares
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 LOOPS_AT_A_STEP = 0.5
@@ -26,13 +26,10 @@ seldom does.
 
 def is_tested(chain: Chain) -> bool:
     """Whether cycles of one loop that close to less than a step test so many steps that none needs to be trusted."""
-    (low, high), poses, tested = chain.ends.T, chain.poses, np.zeros(chain.size, bool)
+    (low, high), poses = chain.ends.T, chain.poses
     short = np.flatnonzero((chain.path[low] == chain.path[high]) & (high - low <= LONGEST))
     closing = short[closes(chain.motion[short], _between(poses, low[short], high[short]), gate(chain))]
-    for ahead in range(1, LONGEST + 1):
-        over = closing[high[closing] - low[closing] >= ahead]
-        tested[low[over] + ahead] = True
-    return bool(tested.sum() > TESTED * (chain.step_edge >= 0).sum())
+    return bool((chain.over(chain.ends[closing]) > 0).sum() > TESTED * (chain.step_edge >= 0).sum())
 
 
 def contradicted_from_afar(graph: ViewGraph, kept: Bools) -> tuple[int, int, int]:
@@ -40,8 +37,7 @@ def contradicted_from_afar(graph: ViewGraph, kept: Bools) -> tuple[int, int, int
     many there are. Where one was measured wrong, kept edges over few of them tell, and two that begin beside it, one on
     either side, whose other ends lie as near, where nothing is left out.
     """
-    steps = linear_forest(graph.edges, graph.vertex_count, sequential_edges(graph))
-    chain = make_chain(graph, steps)
+    chain = make_chain(graph, sequential_edges(graph))
     inner = chain.step_edge >= 0
     ends = chain.ends[kept[chain.loop_edge]]
     near = [ends[np.diff(ends, axis=1)[:, 0] <= LONGEST]]
@@ -73,7 +69,7 @@ def agreeing_loops(chain: Chain, among: Bools) -> int:
         spread = chain.covariance[rows[first]] + chain.covariance[rows[second]]
         spread = spread + (chain.step_covariance[low[second]] if down else 0.0)
         spread = spread + (chain.step_covariance[high[first] + max(up, 0)] if up else 0.0)
-        chi2 = gaussian(chain.log(se3.inverse(motion) @ ahead), spread)[1]
+        chi2 = squares(chain.log(se3.inverse(motion) @ ahead), spread)[0]
         closing = closes(motion, ahead, limits) | (chi2 < AS_STATED * len(chain.axes))
         out[first[closing]] = out[second[closing]] = True
     return int(out.sum())
@@ -87,7 +83,7 @@ def gate(chain: Chain) -> tuple[float, float]:
     """Metres and radians to which cycles of right edges close."""
     inner = np.flatnonzero(chain.step_edge >= 0)
     shift = np.linalg.norm(chain.step[inner, :3, 3], axis=1)
-    turn = np.linalg.norm(se3.so3_log(chain.step[inner, :3, :3]), axis=1)
+    turn = se3.rotation_angle(chain.step[inner])
     return float(np.median(shift)) / OF_STEPS, max(float(np.median(turn)), TURN_RAD) / OF_STEPS
 
 
@@ -103,4 +99,4 @@ def closes(motion: Floats, other: Floats, limits: tuple[float, float], widened: 
     """Which motions (K, 4, 4) are the same as others but for so many times the metres and radians of `gate`."""
     left = se3.inverse(motion) @ other
     near = np.linalg.norm(left[:, :3, 3], axis=1) < limits[0] * widened
-    return np.asarray(near & (np.linalg.norm(se3.so3_log(left[:, :3, :3]), axis=1) < limits[1] * widened))
+    return np.asarray(near & (se3.rotation_angle(left) < limits[1] * widened))

@@ -136,7 +136,7 @@ def _found(graph: ViewGraph, trust: str, anyway: bool) -> Backbone | None:
         return None
     if not chosen.any():
         raise GraphError("no edge joins consecutive vertices, so that there is no sequence to trust: use --trust none")
-    steps = linear_forest(graph.edges, graph.vertex_count, chosen)
+    steps = chosen if trust in (AUTO, SEQUENTIAL) else linear_forest(graph.edges, graph.vertex_count, chosen)
     chain = make_chain(graph, steps)
     if not len(chain.loop_edge):
         return None

@@ -18,12 +18,11 @@ from hodge_pipeline.complex.judging import (
 from hodge_pipeline.solvers.backbone.chain import (
     STEPS_OF_PLACE,
     Chain,
-    linear_forest,
     make_chain,
     sequential_edges,
     steps_apart,
 )
-from hodge_pipeline.solvers.backbone.evidence import gaussian, turns
+from hodge_pipeline.solvers.backbone.evidence import squares, turns
 from hodge_pipeline.solvers.backbone.fit import inverse, linearise
 from hodge_pipeline.solvers.backbone.judge import by_path
 from hodge_pipeline.solvers.backbone.parallel import Fused
@@ -49,7 +48,7 @@ def windowed(one: Fused) -> Fused:
     steps, apart = sequential_edges(graph), steps_apart(graph)
     if ((apart > 0) & (apart <= LONGEST)).sum() <= (1 + LOOPS_AT_A_STEP) * steps.sum():
         return one  # nor need a chain be made for it
-    chain = make_chain(graph, linear_forest(graph.edges, graph.vertex_count, steps))
+    chain = make_chain(graph, steps)
     at, near = np.flatnonzero(chain.step_edge >= 0), _near(chain)
     if not _many(chain, near):
         return one
@@ -83,9 +82,10 @@ def _near(chain: Chain) -> Ints:
     positions have one over as many, and over each number below.
     """
     low, high = chain.ends.T
-    gap = np.where(chain.path[low] == chain.path[high], high - low, chain.size)
+    same = chain.path[low] == chain.path[high]
+    gap = np.where(same, high - low, chain.size)
     rare = np.bincount(gap, minlength=chain.size)[2:] < 0.5 * chain.size
-    return np.flatnonzero(gap <= max(STEPS_OF_PLACE, 1 + int(np.argmax(np.append(rare, True)))))
+    return np.flatnonzero(same & (gap <= max(STEPS_OF_PLACE, 1 + int(np.argmax(np.append(rare, True))))))
 
 
 def _many(chain: Chain, rows: Ints) -> bool:
@@ -117,7 +117,7 @@ def _agreeing(chain: Chain, near: Ints) -> tuple[Floats, Floats]:
     with, and for steps that two or more speak against, and none for.
     """
     linear, ends, size = linearise(chain, chain.poses), chain.ends[near], len(chain.axes)
-    chi2 = gaussian(linear.loops[0][near], by_path(linear, near))[1]
+    chi2 = squares(linear.loops[0][near], by_path(linear, near))[0]
     low, high = chain.poses[ends[:, 0]], chain.poses[ends[:, 1]]
     closing = closes(chain.motion[near], se3.inverse(low) @ high, gate(chain), np.sqrt(np.diff(ends, axis=1)[:, 0]))
     usual = chi2[closing | (chain.stated & (chi2 < AS_STATED * size))]
