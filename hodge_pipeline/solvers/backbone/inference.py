@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hodge_pipeline.complex.series import series_classes
-from hodge_pipeline.solvers.backbone.chain import Chain, one_of_each_place
+from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place, one_of_each_place
 from hodge_pipeline.solvers.backbone.evidence import EVEN, Wrong, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, from_rotations, linearise, settled, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, judge
@@ -120,40 +120,52 @@ class _Trial:
 
     def grown(self) -> tuple[Bools, Floats, Linear] | None:
         """The loops (M,) that say much by themselves and those that they speak for, the strongest first; the shares of
-        right and wrong ones; and poses. Where no more loops stand out, a place is added at a time, and left out if all
-        are less likely with it.
+        right and wrong ones; and poses. Where no more loops stand out, that place of a few is added with which all are
+        likeliest, while this makes them likelier.
 
-        One loop of each place counts, since a group that is mistaken vouches for itself. Loops that little speaks for
-        may be wrong in one way together, and bend the poses until right ones do not fit.
+        Loops that little speaks for may be wrong in one way together, and bend the poses until right ones do not fit.
         """
-        linear, shares, always = self.start, self.shares, self.always
-        ends, limit = linear.chain.places, 0.5 * np.log(max(len(always), 1))
+        always, ends = self.always, self.start.chain.places
+        limit = 0.5 * np.log(max(len(always), 1))
         used = (self.alone.factor > 2 * limit) | always
-        top, before, place, closed = -np.inf, used, np.zeros_like(used), np.zeros_like(used)
+        found = self.tried(used, self.start, self.shares)
         for number in range(MOST_GROWN):
-            rows = np.flatnonzero(used)
-            rows = rows[one_of_each_place(ends[rows])] if len(rows) else rows
-            reduced = thinned(linear.chain, rows)
-            if not self.thin and len(reduced.active) < len(rows):
+            if found is None:
                 return None
-            fit = settled(Fit(reduced, linear), MOST_STEPS)
-            judged = judge(fit.linear, fit, shares, self.wrong)
-            likelier, likelihood = _mixed(judged)
-            if place.any() and likelihood < top:
-                used, closed = before, closed | place
-            else:
-                linear, shares, top, place = fit.linear, likelier, likelihood, np.zeros_like(used)
-                speaks = np.minimum(judged.factor, judged.log_odds)
-                before, used = used, (speaks > limit) | (used & (speaks > 0)) | always
-                if not number or used.sum() > before.sum():
-                    continue
-            may = np.flatnonzero((speaks > 0) & ~used & ~closed)
-            may = may[cKDTree(ends[used]).query(ends[may], p=np.inf)[0] > 1.0]
-            if not len(may):
+            likelihood, speaks, shares, linear = found
+            before, used = used, (speaks > limit) | (used & (speaks > 0)) | always
+            if not number or used.sum() > before.sum():
+                found = self.tried(used, linear, shares)
+                continue
+            open_ = np.where(used, 0.0, speaks)
+            open_[cKDTree(ends[used]).query(ends, p=np.inf)[0] <= 1.0] = 0.0
+            more = list[Bools]()
+            while len(more) < MOST_TRIED and open_.max(initial=0.0) > 0:
+                place = np.abs(ends - ends[np.argmax(open_)]).max(axis=1) < 1.0
+                more.append(used | (place & (open_ > 0)))
+                open_[place] = 0.0
+            each = [(one, other) for one in more if (other := self.tried(one, linear, shares)) is not None]
+            best = max(each, key=lambda pair: pair[1][0], default=(used, found))
+            if best[1][0] <= likelihood:
                 break
-            place[may] = np.abs(ends[may] - ends[may[np.argmax(speaks[may])]]).max(axis=1) < 1.0
-            before, used = used, used | place
-        return used | ((speaks > 0) & ~closed), shares, linear
+            used, found = best
+        return used, shares, linear
+
+    def tried(self, used: Bools, linear: Linear, shares: Floats) -> tuple[float, Floats, Floats, Linear] | None:
+        """How likely all loops are at the poses that one of each place of those `used (M,)` leads to, as a place is one
+        testimony; what speaks for each (M,), the less of its odds and its factor; the shares of right and wrong ones;
+        and these poses.
+        """
+        rows, ends = np.flatnonzero(used), self.start.chain.places
+        rows = rows[one_of_each_place(ends[rows])] if len(rows) else rows
+        reduced = thinned(self.start.chain, rows)
+        if not self.thin and len(reduced.active) < len(rows):
+            return None
+        fit = settled(Fit(reduced, linear), MOST_STEPS)
+        judged = judge(fit.linear, fit, shares, self.wrong)
+        shares, _ = _mixed(judged)
+        each = np.logaddexp(np.log(shares[0]) + judged.factor, np.log(shares[1])) / loops_at_place(ends)
+        return float(each.sum()), np.minimum(judged.factor, judged.log_odds), shares, fit.linear
 
     def agreed(self, used: Bools, shares: Floats, linear: Linear) -> tuple[Bools, Judged, Linear] | None:
         """The loops (M,) that agree with the poses that they lead to, from those that are `used (M,)` on; how all were
@@ -196,8 +208,8 @@ REARRANGED = 3
 """Times that the loops are judged, at first and after places were left out or added: a limit on cost."""
 
 
-MOST_GROWN = 30
-"""Rounds of it: a limit on cost."""
+MOST_GROWN, MOST_TRIED = 30, 3
+"""Rounds of it, and places that are tried in each: limits on cost."""
 
 
 def _mixed(judged: Judged) -> tuple[Floats, float]:
