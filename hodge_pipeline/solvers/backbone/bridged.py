@@ -30,7 +30,7 @@ from hodge_pipeline.solvers.backbone.inference import (
 )
 from hodge_pipeline.solvers.backbone.judge import by_path
 from hodge_pipeline.solvers.backbone.places import MISTAKEN_PLACES, MOST_STEPS, agreeing_groups
-from hodge_pipeline.solvers.backbone.scales import learn_scales
+from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales
 from hodge_pipeline.types import Bools, Ints
 
 MOST_BREAKS, MOST_TRIED = 10, 2
@@ -63,7 +63,11 @@ def infer_bridged(chain: Chain, always: Bools, thin: bool, most: int = MOST_BREA
 
 def _better(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]) -> tuple[Chain, Inferred] | None:
     """The chain with one more step bridged, and its loops judged; None where it has none that is broken."""
-    for broken, least in _candidates(chain, found):
+    founds = [found]
+    if found.scales != Scales() and (not found.confirmed or (chain.stated and found.scales.surprise() > 0)):
+        # a break that all loops see looks like larger errors of all steps: with these as stated, the loops agree on it
+        founds += [other for other in [judge(chain, scales=Scales())] if other is not None]
+    for broken, least in [each for one in founds for each in _candidates(chain, one)]:
         tried = bridged(chain, broken)
         same = judge(tried, scales=found.scales)  # so that nothing but the step differs
         if same is not None and same.log_evidence > found.log_evidence + least:
