@@ -35,13 +35,12 @@ def test_a_mistaken_place_that_bends_the_others_is_left_out(monkeypatch: pytest.
     assert made.error_m(found.world_from_cam) < 2.5
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_loops_of_little_evidence_wait_for_those_that_say_more(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_loops_of_little_evidence_wait_for_those_that_say_more(monkeypatch: pytest.MonkeyPatch) -> None:
     """An odometry that turns by a degree a step refutes no loop over hundreds of steps: all that were a little likelier
     right counted at once, and a mistaken place among them bent the path until right ones did not fit, 5.9 m off.
     """
     monkeypatch.setattr("tests.backbone_graphs.STEP", (0.02, 0.05))
-    made = drive(world="town", count=1500, loops=500, wrong=0.4, in_groups=True, group=10, seed=seed)
+    made = drive(world="town", count=1500, loops=500, wrong=0.4, in_groups=True, group=10)
     found = diagnose(made.graph)
     np.testing.assert_array_equal(found.kept, made.right)
     assert made.error_m(found.world_from_cam) < 1.5

@@ -306,7 +306,9 @@ class Fit:
 
 
 LEAST_WON, HALVINGS = 0.01, 10
-"""Of χ²: a step that wins less moves nothing by more than a tenth of its standard deviation."""
+"""Of χ²: a step that wins less moves nothing by more than a tenth of its standard deviation. Times that a step is
+halved: with four a descent over 15,000 poses that wrong loops had bent ended at four times the least χ².
+"""
 TORN, SHARE_WON = 10.0, 1e-4
 """χ² to a number that loops state, from where on these contradict each other, and the share of it that a step must win
 then: no poses make them fit.

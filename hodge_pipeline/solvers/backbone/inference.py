@@ -13,7 +13,7 @@ from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place, one_of_
 from hodge_pipeline.solvers.backbone.evidence import EVEN, Wrong, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, from_rotations, linearise, settled, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, judge
-from hodge_pipeline.solvers.backbone.places import MOST_STEPS, Places
+from hodge_pipeline.solvers.backbone.places import MOST_STEPS, MOST_TRIED, Places
 from hodge_pipeline.solvers.backbone.polish import polished
 from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales
 from hodge_pipeline.types import Bools, Floats
@@ -118,6 +118,11 @@ class _Trial:
         linear, reduced = fit.linear if used.any() else start, thinned(chain, np.flatnonzero(used))
         return Inferred(used, judged, self.scales, start, linear, reduced, top, confirmed)
 
+    @cached_property
+    def testimony(self) -> Floats:
+        """The share (M,) that each loop has in what its place says."""
+        return 1 / loops_at_place(self.start.chain.places)
+
     def grown(self) -> tuple[Bools, Floats, Linear] | None:
         """The loops (M,) that say much by themselves and those that they speak for, the strongest first; the shares of
         right and wrong ones; and poses. Where no more loops stand out, that place of a few is added with which all are
@@ -164,8 +169,8 @@ class _Trial:
         fit = settled(Fit(reduced, linear), MOST_STEPS)
         judged = judge(fit.linear, fit, shares, self.wrong)
         shares, _ = _mixed(judged)
-        each = np.logaddexp(np.log(shares[0]) + judged.factor, np.log(shares[1])) / loops_at_place(ends)
-        return float(each.sum()), np.minimum(judged.factor, judged.log_odds), shares, fit.linear
+        each = np.logaddexp(np.log(shares[0]) + judged.factor, np.log(shares[1]))
+        return float(self.testimony @ each), np.minimum(judged.factor, judged.log_odds), shares, fit.linear
 
     def agreed(self, used: Bools, shares: Floats, linear: Linear) -> tuple[Bools, Judged, Linear] | None:
         """The loops (M,) that agree with the poses that they lead to, from those that are `used (M,)` on; how all were
@@ -208,8 +213,8 @@ REARRANGED = 3
 """Times that the loops are judged, at first and after places were left out or added: a limit on cost."""
 
 
-MOST_GROWN, MOST_TRIED = 30, 3
-"""Rounds of it, and places that are tried in each: limits on cost."""
+MOST_GROWN = 30
+"""Rounds in which loops are added: a limit on cost."""
 
 
 def _mixed(judged: Judged) -> tuple[Floats, float]:

@@ -31,7 +31,7 @@ a path that closes once would stay open: its loops can say little more than that
 """
 ROUNDS = 6
 MOST_TRIED = 3
-"""Places that are left out on trial each time, and groups of unused loops that may be added: limits on cost."""
+"""Places that are left out, or added, on trial each time, and groups of loops that may be added: limits on cost."""
 CLEARLY = float(np.log(20.0))
 """Log-odds that a change must win."""
 ADJACENT = 2.0
