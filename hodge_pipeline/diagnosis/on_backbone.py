@@ -108,7 +108,9 @@ def _reasons(
     lines = []
     for edge, name in enumerate(verdict.tolist()):
         if backbone.steps[edge] and name != WRONG:
-            passed = f"{over[edge]} confirmed loops pass over it" if over[edge] else "no confirmed loop passes over it"
+            # those over a bridge between two paths pass over their ends too, which lie in no cycle
+            some = over[edge] > 0 and name != UNTESTABLE
+            passed = f"{over[edge]} confirmed loops pass over it" if some else "no confirmed loop passes over it"
             lines.append(f"an edge of the backbone: {passed}")
             continue
         away = distance(residual[0][edge], residual[1][edge])
