@@ -79,7 +79,9 @@ class Network:
 
 
 def effective_resistance(edges: Ints, used: Bools, network: Network) -> Floats:
-    """The resistance (E,) between the ends of each edge through the other ones that are used, whose network it is."""
+    """The resistance (E,) between the ends of each edge through the other ones that are used, whose network it is; ∞ for
+    bridges and for them alone. An estimate leaves the other edges at least the share by which it may err.
+    """
     own = np.flatnonzero(used & (edges[:, 0] != edges[:, 1]))
     out = network.between(edges)
     rest = np.maximum(1 - out[own], np.finfo(float).eps if network.is_exact else np.sqrt(2 / SKETCHES))

@@ -211,8 +211,6 @@ def _lone(chain: Chain, used: Bools) -> Bools:
 
 REARRANGED = 3
 """Times that the loops are judged, at first and after places were left out or added: a limit on cost."""
-
-
 MOST_GROWN = 30
 """Rounds in which loops are added: a limit on cost."""
 
