@@ -79,8 +79,8 @@ class Network:
 
 
 def effective_resistance(edges: Ints, used: Bools, network: Network) -> Floats:
-    """The resistance (E,) between the ends of each edge through the other ones that are used, whose network it is: ∞ for
-    bridges and for them alone. Estimates leave the others at least the share by which they may err.
+    """The resistance (E,) between the ends of each edge through the other ones that are used, whose network it is: ∞
+    for bridges and for them alone. Estimates leave the others at least the share by which they may err.
     """
     own = np.flatnonzero(used & (edges[:, 0] != edges[:, 1]))
     out = network.between(edges)
