@@ -105,6 +105,19 @@ def test_the_full_objective_ends_below_every_neighbour():
     assert again.metrics["objective"] == pytest.approx(solution.metrics["objective"], rel=1e-9)
 
 
+def test_the_full_descent_begins_at_given_poses_that_are_near_its_minimum(monkeypatch):
+    graph, _ = ladder(0.3, rungs=40)
+    best, made, isotropic = solve(graph), [], minimise.descend_isotropic
+    monkeypatch.setattr(minimise, "descend_isotropic", lambda *some: made.append(1) or isotropic(*some))
+    drawn = np.random.default_rng(0).normal(size=(graph.vertex_count, 6))
+    near, far = best.world_from_cam @ se3.exp(0.02 * drawn), se3.exp(drawn * np.repeat([1.0, 5.0], 3))
+    for start, from_isotropic in ((best.world_from_cam, False), (near, False), (far, True)):
+        made.clear()
+        found = solve(graph, start=start, initial="given")
+        assert found.metrics["objective"] == pytest.approx(best.metrics["objective"], rel=1e-6)
+        assert bool(made) == from_isotropic
+
+
 def test_a_planar_graph_is_solved_in_the_plane():
     graph, _ = ladder(0.2, planar=True)
     poses = solve(graph).world_from_cam

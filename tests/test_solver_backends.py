@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from scipy.sparse import bsr_matrix, csr_matrix
 
+from backbone_graphs import drive
 from hodge_pipeline import se3
 from hodge_pipeline.solvers import backends
 from hodge_pipeline.solvers import multigrid as multigrid_module
 from hodge_pipeline.solvers.backends import BackendName, choose, laplacian_factor
 from hodge_pipeline.solvers.cg import truncated_cg
 from hodge_pipeline.solvers.covariance import marginal_covariances
+from hodge_pipeline.solvers.direct import factor_s
 from hodge_pipeline.solvers.iterative import IterativeSolver
 from hodge_pipeline.solvers.linear import factorise
 from hodge_pipeline.solvers.maximum_likelihood import solve
@@ -96,6 +98,23 @@ def test_auto_factorises_what_is_small_or_like_a_chain_and_preconditions_what_is
     chosen, plan = choose("auto", chain[:-1], chain[1:], len(chain) - 1)
     assert chosen is None
     assert plan.ordered
+
+
+def test_auto_takes_the_scalar_laplacians_of_a_town_though_its_joint_factor_costs_more_than_multigrid() -> None:
+    graph = drive(world="town", dimension=3, count=30_000, loops=12_000, wrong=0.0).graph
+    tail, head = graph.edges.T
+    chosen, plan = choose("auto", tail, head, graph.vertex_count - 1)
+    assert chosen is None
+    assert factor_s(plan, 6) > backends.SECONDS_A_BLOCK * (plan.size + 2 * len(tail))
+
+
+def test_auto_does_not_look_for_the_order_of_a_chain_tangled_by_loops_between_any_places() -> None:
+    count, rng = 20_000, np.random.default_rng(0)
+    steps = np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
+    tail, head = np.concatenate([steps, rng.integers(0, count, (5_000, 2))]).T
+    chosen, plan = choose("auto", tail, head, count - 1)
+    assert chosen is not None
+    assert not plan.ordered
 
 
 def test_a_cycle_is_symmetric_and_positive_definite() -> None:

@@ -14,6 +14,7 @@ from scipy.sparse import csc_matrix, csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from hodge_pipeline.solvers.cg import solved_columns
+from hodge_pipeline.solvers.direct import factor_s, laplacian_step_s
 from hodge_pipeline.solvers.elimination import Elimination, Ordering, plan_elimination, unordered
 from hodge_pipeline.solvers.linear import Factor, factorise, fill_reducing_order
 from hodge_pipeline.solvers.multigrid import Coarsening, Modes, Preconditioning, multigrid
@@ -24,12 +25,14 @@ ITERATIVE_FROM = 15_000
 """Vertices: below, a factorisation and a hundred solves cost less than the hierarchies."""
 CHAIN_EDGES_PER_VERTEX = 1.5
 """With more, so large a graph fills up: its order of elimination is not even looked for."""
-WIDEST = 5.0
+WIDEST = 20.0
 """Of the levels of what the block elimination leaves over, as a share of the square root of its vertices: those of
-street maps are half as wide. Of wider ones, as in a lattice or a tangle, the order itself would cost too much.
+towns of 20,000 to 80,000 poses are up to 16. Of wider ones, as in a tangle, the order itself would cost too much.
 """
-SECONDS_A_PRODUCT, SECONDS_A_BLOCK = 0.25e-9, 6e-6
-"""Measured, of one Newton step: of products of entries in a factorisation; of blocks of the matrix by multigrid."""
+SECONDS_A_BLOCK = 2e-5
+"""Measured, of one Newton step: of blocks of the matrix by multigrid."""
+LAPLACIAN_STEPS = 20
+"""Of CG with the scalar Laplacians to a Newton step of such towns."""
 JOINT_SIZE = 6
 SCALAR_TOLERANCE, MAX_SCALAR_STEPS = 1e-12, 300
 
@@ -49,7 +52,8 @@ def choose(
         return None, plan_elimination(tail, head, count, fill_reducing_order)
     if len(tail) < CHAIN_EDGES_PER_VERTEX * count:
         plan = plan_elimination(tail, head, count, _order_of_narrow)
-        if SECONDS_A_PRODUCT * JOINT_SIZE**3 * plan.work < SECONDS_A_BLOCK * (count + 2 * len(tail)):
+        by_cg = factor_s(plan, 1) + LAPLACIAN_STEPS * laplacian_step_s(plan)
+        if min(by_cg, factor_s(plan, JOINT_SIZE)) < SECONDS_A_BLOCK * (count + 2 * len(tail)):
             return None, plan
     return _multigrid(), unordered(count)
 

@@ -31,11 +31,20 @@ SECONDS_A_FILL, SECONDS_A_MATVEC = 8e-9, 2e-7
 """Measured: of a factorisation with blocks of size s, times s³; of a CG step with the two scalar Laplacians."""
 
 
+def factor_s(plan: Elimination, size: int) -> float:
+    """Seconds of a factorisation with blocks of this size."""
+    return SECONDS_A_PRODUCT * size**3 * plan.work + SECONDS_A_VERTEX * size**2 * plan.core
+
+
+def laplacian_step_s(plan: Elimination) -> float:
+    """Seconds of a CG step with the two scalar Laplacians."""
+    return SECONDS_A_FILL * plan.fill + SECONDS_A_MATVEC * plan.size
+
+
 def steps_worth_a_factor(plan: Elimination, size: int) -> int:
     """How many CG steps with the scalar Laplacians cost as much as a factorisation with blocks of this size."""
-    factor_s = SECONDS_A_PRODUCT * size**3 * plan.work + SECONDS_A_VERTEX * size**2 * plan.core
-    step_s = SECONDS_A_FILL * plan.fill + SECONDS_A_MATVEC * plan.size
-    return int(factor_s / step_s) if step_s > 0 else 0
+    step_s = laplacian_step_s(plan)
+    return int(factor_s(plan, size) / step_s) if step_s > 0 else 0
 
 
 @dataclass

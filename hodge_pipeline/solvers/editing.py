@@ -183,7 +183,7 @@ class GraphEditor:
         owed = self._state.owed + to_come
         descent = here(near, full)
         if owed > LIMITS.relative_tolerance * descent.point.cost:
-            descent = minimise(near, "given", limits, full, near_minimum=True)
+            descent = minimise(near, "given", limits, full)
             owed = 0.0 if descent.converged else math.inf
         used = np.zeros(self.graph.edge_count)
         used[base.used] = scale[base.used]

@@ -14,7 +14,7 @@ from hodge_pipeline.solvers import direct
 from hodge_pipeline.solvers.cg import truncated_cg
 from hodge_pipeline.solvers.full_information import FullObjective
 from hodge_pipeline.solvers.isotropic import CG_FIRST_TO, JointObjective, cg_first
-from hodge_pipeline.solvers.newton import ROUNDING_REACHED, Descent, Limits, Point, descend
+from hodge_pipeline.solvers.newton import FAR_FROM_MINIMUM, ROUNDING_REACHED, Descent, Limits, Point, descend
 from hodge_pipeline.solvers.objective import (
     IsotropicObjective,
     IsotropicPoint,
@@ -29,6 +29,11 @@ from hodge_pipeline.types import Floats, Ints
 Watch: TypeAlias = Callable[[Point], None]
 WARM_START_TOLERANCE = 1e-5
 """The isotropic optimum starts the full objective: nearer than this they differ anyway."""
+
+AS_PROMISED = 0.95
+"""Of what a full step should win: near the minimum, within .02 rad and .05 m, it wins .997 to 1.01 of it on five graphs
+of the literature, from their odometry .09 to .88.
+"""
 
 NEAR_RAD = 0.01
 """So near half a turn an edge pulls with a hundredth of its weight: the square, 1e-4, is what a step wins, and the
@@ -45,21 +50,17 @@ def minimise(
     limits: Limits,
     full: bool,
     watch: Watch | None = None,
-    *,
-    near_minimum: bool = False,
 ) -> Descent:
-    """The descent of the isotropic objective and, where `full`, of the full one from its end.
-
-    `near_minimum`: the initial poses are near the full minimum already, so that the full descent begins there; it does
-    so too where CG is not tried for the isotropic one.
+    """The descent of the isotropic objective and, where `full`, of the full one from its end: of this alone where CG is
+    not tried for the isotropic one, and from given poses where its first step wins what it promises.
     """
     begin = setup.initial(initial)
-    found = _minimum(setup, begin, limits, full, watch, near_minimum)
+    found = _minimum(setup, begin, limits, full, watch, at_once=initial == "given")
     while found.converged or found.reason == ROUNDING_REACHED:
         off = turned_back(setup.problem, found.point.rotations, found.point.translations)
         if off is None:
             break
-        lower = _minimum(setup, off, limits.after(len(found.costs) - 1), full, watch, near_minimum=full)
+        lower = _minimum(setup, off, limits.after(len(found.costs) - 1), full, watch, at_once=True)
         if lower.point.cost >= found.point.cost:
             break
         found = replace(lower, costs=found.costs + lower.costs[1:], cg_steps=found.cg_steps + lower.cg_steps)
@@ -67,12 +68,23 @@ def minimise(
 
 
 def _minimum(
-    setup: Setup, begin: tuple[Floats, Floats], limits: Limits, full: bool, watch: Watch | None, near_minimum: bool
+    setup: Setup,
+    begin: tuple[Floats, Floats],
+    limits: Limits,
+    full: bool,
+    watch: Watch | None,
+    at_once: bool,
 ) -> Descent:
-    """The descent from there, which may end at a saddle."""
-    if full and (near_minimum or full_at_once(setup.problem)):
-        objective = full_objective(setup)
-        return descend(objective, objective.at(*begin), limits, setup.rounding, watch)
+    """The descent from there, which may end at a saddle: where `full`, `at_once` of the full objective, unless its
+    first step wins too little.
+    """
+    direct = full_at_once(setup.problem)
+    if full and (at_once or direct):
+        objective, least_won = full_objective(setup), 0.0 if direct else AS_PROMISED
+        found = descend(objective, objective.at(*begin), limits, setup.rounding, watch, least_won=least_won)
+        if found.reason != FAR_FROM_MINIMUM:
+            return found
+        del objective, found
     loose = max(limits.relative_tolerance, WARM_START_TOLERANCE)
     warming = Limits(limits.max_iterations // 2, loose, limits.deadline_s) if full else limits
     warm = descend_isotropic(setup.problem, begin, warming, setup.rounding, watch)

@@ -15,6 +15,7 @@ MAX_HALVINGS = 40
 CG_LIMIT_REACHED = "limit of CG steps reached"
 TIME_LIMIT_REACHED, ITERATION_LIMIT_REACHED = "time limit reached", "iteration limit reached"
 ROUNDING_REACHED = "no further decrease within rounding"
+FAR_FROM_MINIMUM = "the first step wins less than it promises"
 CG_SHARE = 0.1
 """Of what further steps may still win: where so little is left in a linear system, it is solved."""
 LOOSEST_TOLERANCE, TIGHTEST_TOLERANCE = 0.05, 1e-3
@@ -83,10 +84,12 @@ def descend(
     floor: float,
     watch: Callable[[Point], None] | None = None,
     most_cg_steps: float = math.inf,
+    least_won: float = 0.0,
 ) -> Descent:
     """The descent from a point. A cost or decrease below `floor` is rounding: there is nothing left to win.
 
-    It ends, not converged, once it has taken more than `most_cg_steps`.
+    It ends, not converged, once it has taken more than `most_cg_steps`, and where the first step wins less than a share
+    `least_won` of what its model promises.
     """
     costs, cg_steps, tolerance, before = [point.cost], 0, LOOSEST_TOLERANCE, math.inf
     for _ in range(limits.max_iterations):
@@ -96,6 +99,8 @@ def descend(
         step = objective.step(point, tolerance, CG_SHARE * smallest)
         cg_steps += step.cg_steps
         new = _line_search(objective, point, step)
+        if len(costs) == 1 and point.cost - (new or point).cost < least_won * step.predicted - floor:
+            return Descent(point, tuple(costs), cg_steps, False, FAR_FROM_MINIMUM)
         if new is None:
             converged = step.predicted <= math.sqrt(limits.relative_tolerance) * point.cost
             return Descent(point, tuple(costs), cg_steps, converged, ROUNDING_REACHED)
