@@ -15,7 +15,6 @@ from hodge_pipeline.solvers.backbone import fit
 from hodge_pipeline.solvers.backbone.anyway import backbone_anyway
 from hodge_pipeline.solvers.backbone.chain import linear_forest, make_chain, sequential_edges
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, linearise, root, settled
-from hodge_pipeline.solvers.backbone.judge import left_out
 from hodge_pipeline.solvers.backbone.sparse import Network
 from hodge_pipeline.solvers.backbone.trust import find_backbone, of_every_loop
 from hodge_pipeline.solvers.maximum_likelihood import solve
@@ -85,7 +84,7 @@ def test_left_out_residuals_are_those_of_a_solve_without_the_loop(monkeypatch: p
     monkeypatch.setattr(fit, "LEAST_WON", 1e-12)
     chain = chain_of(drive(wrong=0.0, loops=12).graph)
     found = settled(Fit(Reduced.of(chain, np.arange(12)), linearise(chain, chain.poses)), 30)
-    without = left_out(found)[0]
+    without = found.left_out(found.reduced.of_loops)[0]
     for row in (0, 5, 11):
         others = Reduced.of(chain, np.delete(np.arange(12), row))
         actual = settled(Fit(others, found.linear), 30).linear.loops[0][row]
@@ -167,18 +166,27 @@ def test_a_covariance_that_sums_left_indefinite_has_a_root() -> None:
     np.testing.assert_allclose(found @ np.swapaxes(found, 1, 2), covariance, atol=2e-3)
 
 
-def test_random_motions_between_places_seen_again_are_not_used(data_dir: Path) -> None:
-    graph = read_graph(data_dir / "pose_graphs/sesync/intel.g2o").graph
-    assert graph is not None
+@pytest.mark.parametrize("share", [0.6, 1.0])
+def test_random_motions_between_places_seen_again_are_not_used(share: float, data_dir: Path) -> None:
+    """The first 500 poses of INTEL: 30 loops join each two places, of which a few agree by chance, 1.9 times as far off
+    as the odometry. Of the 80 that are right none is lost where the others are wrong.
+    """
+    whole = read_graph(data_dir / "pose_graphs/sesync/intel.g2o").graph
+    assert whole is not None
+    rows = np.flatnonzero((whole.edges < 500).all(axis=1))
+    graph = replace(whole.select(rows), vertex_ids=whole.vertex_ids[:500])
     loops = np.flatnonzero(np.diff(graph.edges, axis=1)[:, 0] != 1)
     truth = find_backbone(graph, "sequential")
     assert truth is not None
-    motion, size = graph.i_from_j.copy(), [0.0, 0.0, 0.7, 1.5, 1.5, 0.0]
-    motion[loops] = se3.exp(np.random.default_rng(0).normal(size=(len(loops), 6)) * size)
-    made = Drive(replace(graph, i_from_j=motion), truth.world_from_cam, np.ones(graph.edge_count, bool))
+    rng = np.random.default_rng(0)
+    wrong = loops[rng.random(len(loops)) < share]
+    motion, right = graph.i_from_j.copy(), ~np.isin(np.arange(graph.edge_count), wrong)
+    motion[wrong] = se3.exp(rng.normal(size=(len(wrong), 6)) * [0.0, 0.0, 0.7, 1.5, 1.5, 0.0])
+    made = Drive(replace(graph, i_from_j=motion), truth.world_from_cam, right)
     backbone = find_backbone(made.graph)
-    assert backbone is not None and not backbone.used[loops].any()
-    assert made.error_m(backbone.world_from_cam) <= 1.02 * made.error_m(made.odometry())
+    assert backbone is not None and backbone.used[right].all()
+    ratio = made.error_m(backbone.world_from_cam) / made.error_m(made.odometry())
+    assert ratio < 0.1 if share < 1 else not backbone.used[wrong].any() and ratio < 1.02
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -312,7 +320,7 @@ def test_edges_written_the_other_way_round_change_nothing() -> None:
 
 
 def test_the_order_of_edges_in_the_file_changes_nothing(data_dir: Path) -> None:
-    graph = read_graph(data_dir / "pose_graphs/slam_loops/bicocca/B25b_0.250.g2o").graph
+    graph = read_graph(data_dir / "pose_graphs/slam_loops/bicocca/B25b_0.500.g2o").graph
     assert graph is not None
     order = np.random.default_rng(3).permutation(graph.edge_count)
     one, other = find_backbone(graph), find_backbone(graph.select(order))

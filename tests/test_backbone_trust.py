@@ -116,3 +116,11 @@ def test_loops_that_nothing_can_be_computed_with_confirm_nothing(monkeypatch: py
     found = diagnose(made.graph, DiagnosisOptions(trust="sequential"))
     assert not found.kept[399:].any() and found.kept[:399].all()
     assert made.error_m(found.world_from_cam) == pytest.approx(made.error_m(made.odometry()))
+
+
+def test_a_graph_of_the_plane_stated_in_space_has_the_backbone_of_one_in_the_plane() -> None:
+    made = drive(dimension=2)
+    flat, lifted = find_backbone(made.graph), find_backbone(replace(made.graph, dimension=3))
+    assert flat is not None and lifted is not None
+    np.testing.assert_array_equal(lifted.used, flat.used)
+    np.testing.assert_allclose(lifted.world_from_cam, flat.world_from_cam, atol=1e-9)

@@ -287,9 +287,9 @@ def test_two_scanners_in_a_folder_are_followed_apart(tmp_path: Path) -> None:
     folder, road = tmp_path / "sweeps", Road(10.0)
     folder.mkdir()
     car_from_front = se3.exp(np.array([0, 0, np.pi / 2, 1.0, 0.5, -0.8]))
-    top, front = (SpinningScanner(road, 0, beams, columns=360, noise=1.0) for beams in (16, 12))
+    top, front = (SpinningScanner(road, 0, beams, columns=240, noise=1.0) for beams in (16, 12))
     for number in range(12):
-        write_organised(folder / f"top_{number}.pcd", top.sweep(number), 16 * 360, np.nan)
+        write_organised(folder / f"top_{number}.pcd", top.sweep(number), 16 * 240, np.nan)
         points = se3.transform(se3.inverse(car_from_front), front.sweep(number).points.astype(float))
         write_ply(folder / f"{number}_front.ply", PointCloud(points.astype(np.float32)))
     done = run(load_recipe("lidar", SHORT, folder), tmp_path / "run")

@@ -34,7 +34,7 @@ from hodge_pipeline.solvers.backbone.anyway import backbone_anyway
 from hodge_pipeline.solvers.backbone.chain import vertex_ranks
 from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
 from hodge_pipeline.solvers.resistance import Network
-from hodge_pipeline.solvers.weights import OUT_OF_PLANE, is_planar
+from hodge_pipeline.solvers.weights import OUT_OF_PLANE, dimension_of
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 DEFAULTS = DiagnosisOptions()
@@ -50,7 +50,7 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     and edges that name no vertex.
     """
     check_graph(graph)
-    graph = replace(graph, dimension=2) if is_planar(graph) else graph
+    graph = replace(graph, dimension=dimension_of(graph))
     found = backbone_or_diagnosis(graph, options)
     return found if isinstance(found, Diagnosis) else judged_on_backbone(graph, found)
 

@@ -23,7 +23,7 @@ from hodge_pipeline.solvers.backbone.trust import Backbone
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.reweighted import reweighted
 from hodge_pipeline.solvers.setup import check_choice, held_rows
-from hodge_pipeline.solvers.weights import edge_weights, is_planar
+from hodge_pipeline.solvers.weights import dimension_of, edge_weights
 from hodge_pipeline.types import Bools, Floats, Solution, ViewGraph
 from hodge_pipeline.types.text import counted
 
@@ -54,7 +54,7 @@ def solve_robust(
     check_choice("objective", objective, ObjectiveName)
     start = None if start is None else np.asarray(start, float)
     check_graph(graph, start)
-    found = backbone_or_diagnosis(replace(graph, dimension=2) if is_planar(graph) else graph, diagnosis)
+    found = backbone_or_diagnosis(replace(graph, dimension=dimension_of(graph)), diagnosis)
     fixed, unheld = held_rows(graph, start)
 
     def solved(chosen: ViewGraph, poses: Floats) -> Solution:
@@ -107,7 +107,7 @@ def _judged(graph: ViewGraph, found: Diagnosis, solved: Solver) -> Solution:
         weights, final = reweighted(known, weights, final, weighed)
     whole = np.zeros(graph.edge_count)
     whole[np.flatnonzero(weights)] = final.weights * weights[np.flatnonzero(weights)]
-    stated = edge_weights(graph, 2 if graph.dimension == 2 or is_planar(graph) else 3)
+    stated = edge_weights(graph, dimension_of(graph))
     told = (note for note in stated.notes if note not in final.notes)
     notes = (*told, _told(found, whole), *found.notes, *final.notes)
     return _with_confirmation(graph, stated.used, replace(final, weights=whole, notes=notes))
@@ -119,7 +119,7 @@ def is_explained(graph: ViewGraph, solution: Solution) -> bool:
     """
     if has_unit_information(graph):
         return False
-    axes = 3 if graph.dimension == 2 or is_planar(graph) else 6
+    axes = 3 if dimension_of(graph) == 2 else 6
     tree = graph.vertex_count - int(solution.component.max(initial=-1)) - 1
     freedom = axes * (graph.edge_count - tree)
     return not freedom or solution.metrics["objective"] <= freedom + SIGMAS * math.sqrt(2 * freedom)

@@ -16,7 +16,7 @@ from hodge_pipeline.solvers.chordal import initial_rotations
 from hodge_pipeline.solvers.newton import Point
 from hodge_pipeline.solvers.problem import Problem, make_problem, pinned_vertices
 from hodge_pipeline.solvers.rotations import project
-from hodge_pipeline.solvers.weights import Weights, edge_weights, is_planar
+from hodge_pipeline.solvers.weights import Weights, dimension_of, edge_weights
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 InitialName: TypeAlias = Literal["chordal", "given"]
@@ -87,7 +87,7 @@ def prepare(
     check_choice("backend", backend, BackendName)
     check_choice("dimension", dimension, DimensionName)
     check_graph(graph, start)
-    size = (2 if graph.dimension == 2 or is_planar(graph) else 3) if dimension is None else dimension
+    size = dimension_of(graph) if dimension is None else dimension
     weights = edge_weights(graph, size)
     used = graph.edges[weights.used]
     component = connected_components(used, graph.vertex_count)

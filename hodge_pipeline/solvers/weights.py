@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -38,13 +39,15 @@ class Weights:
     notes: tuple[str, ...]
 
 
-def is_planar(graph: ViewGraph) -> bool:
-    """Whether every edge lies in the plane z = 0 and has no information out of it: a lifted 2-D graph."""
-    if not graph.edge_count:
-        return False
+def dimension_of(graph: ViewGraph) -> Literal[2, 3]:
+    """How many dimensions the frames move in: two also where every edge of a graph in space lies in the plane z = 0 and
+    has no information out of it, as of one that was lifted.
+    """
+    if graph.dimension == 2 or not graph.edge_count:
+        return 2 if graph.dimension == 2 else 3
     motion = graph.i_from_j
     off = np.abs(np.concatenate([motion[:, 2, :2], motion[:, :2, 2], motion[:, 2:3, 3]], axis=1)).max()
-    return bool(off < PLANAR_TOLERANCE and not graph.information[:, OUT_OF_PLANE].any())
+    return 2 if off < PLANAR_TOLERANCE and not graph.information[:, OUT_OF_PLANE].any() else 3
 
 
 def edge_weights(graph: ViewGraph, dimension: int) -> Weights:

@@ -12,7 +12,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.judging import FREEDOM, tail_weight
 from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place
 from hodge_pipeline.solvers.backbone.evidence import squares, student
-from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, root, shifted, without_run
+from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, root, shifted
 from hodge_pipeline.types import Bools, Floats, Ints
 
 NEIGHBOURS, SEEDS = 8, 16
@@ -291,7 +291,7 @@ class Runs:
         """Those of a fit, one at least, with errors as large as the usual run has."""
         chain, used, linear = fit.linear.chain, fit.reduced, fit.linear
         low, high = used.ends[used.runs].T
-        residual, total, prior = without_run(fit)
+        residual, total = fit.left_out(used.of_runs)
         chi2, size = student(residual, total)[1], residual.shape[1]
         tense = max(1.0, float(np.median(chi2)) / size)  # as if the steps' scale were too small by the usual run
         log_density, chi2 = student(residual, tense * total)
@@ -303,7 +303,7 @@ class Runs:
             loop_edge=np.full(len(low), -1),
             ends=used.ends[used.runs],
             motion=se3.inverse(poses[low]) @ poses[high] @ ahead,
-            covariance=chain.carried(se3.inverse(turned), tense * prior),
+            covariance=chain.carried(se3.inverse(turned), tense * (total - fit.runs)),
         )
         told = Testimony(others, linearise(others, poses), log_density, np.zeros(len(low)), np.zeros(len(low), bool))
         return cls(told, usual, high, 0.5 * (FREEDOM + size) * np.log1p(chi2 / FREEDOM))

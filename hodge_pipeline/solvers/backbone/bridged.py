@@ -17,7 +17,7 @@ from hodge_pipeline.solvers.backbone.breaks import (
     agreed_breaks,
     unusual_breaks,
 )
-from hodge_pipeline.solvers.backbone.chain import Chain, linked
+from hodge_pipeline.solvers.backbone.chain import Chain, linked, loops_at_place
 from hodge_pipeline.solvers.backbone.evidence import Wrong, mixture, student
 from hodge_pipeline.solvers.backbone.fit import Fit, linearise, settled
 from hodge_pipeline.solvers.backbone.inference import (
@@ -35,6 +35,14 @@ from hodge_pipeline.types import Bools, Ints
 
 MOST_BREAKS, MOST_TRIED = 10, 2
 """That are bridged one after the other, and that are tried each time."""
+
+
+CONTRADICTED = 0.5
+"""Of the loops at the places of used ones: where fewer agree, these are held against motions drawn at random."""
+DRAWN = 3
+"""Times that all motions are drawn."""
+QUANTILE, NORMAL_QUANTILE = 0.75, 1.1503
+"""Of how far motions lie from their middle, which right ones, and a few far off, hardly change; and of a normal one."""
 
 
 def infer_bridged(chain: Chain, always: Bools, thin: bool, most: int = MOST_BREAKS) -> tuple[Chain, Inferred] | None:
@@ -55,10 +63,33 @@ def infer_bridged(chain: Chain, always: Bools, thin: bool, most: int = MOST_BREA
         if better is None:
             break
         chain, found = better
-    if found.confirmed:
-        return chain, found
-    # nor is a break confirmed that they speak of
-    return unbroken, first if first.confirmed else refused(first, always)
+    # where nothing confirms the loops, nor is a break confirmed that they speak of
+    for one, other in ((chain, found), (unbroken, first)):
+        if other.confirmed and not (_contradicted(other) and _found_by_chance(one, other, always, judge)):
+            return one, other
+    return unbroken, refused(first, always)
+
+
+def _contradicted(found: Inferred) -> bool:
+    """Whether most loops at the places of used ones contradict these: of so many some agree by chance."""
+    places, used = found.start.chain.places, found.used
+    return bool(loops_at_place(places[used]).sum() < CONTRADICTED * loops_at_place(places)[used].sum())
+
+
+def _found_by_chance(chain: Chain, found: Inferred, always: Bools, judge: Callable[..., Inferred | None]) -> bool:
+    """Whether loops between the same places say as much if all their motions, but those of `always (M,)`, are drawn at
+    random, as those at hand are spread.
+    """
+    rng, twists = np.random.default_rng(4), chain.log(chain.motion)
+    middle = np.median(twists, axis=0)
+    spread = np.quantile(np.abs(twists - middle), QUANTILE, axis=0) / NORMAL_QUANTILE
+    for _ in range(DRAWN):
+        drawn = chain.exp(middle + spread * rng.standard_normal(twists.shape))
+        motion = np.where(always[:, None, None], chain.motion, drawn)
+        other = judge(replace(chain, motion=motion), scales=found.scales)
+        if other is not None and other.log_evidence > found.log_evidence - BY_CHANCE:
+            return True
+    return False
 
 
 def _better(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]) -> tuple[Chain, Inferred] | None:

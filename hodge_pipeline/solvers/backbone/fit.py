@@ -150,6 +150,16 @@ class Reduced:
         loops = np.searchsorted(ends, chain.ends[active])
         return cls(ends, runs, loops, active, Network.of(np.concatenate([runs, loops]), len(ends)))
 
+    @property
+    def of_runs(self) -> slice:
+        """Rows of the network that are runs."""
+        return slice(len(self.runs))
+
+    @property
+    def of_loops(self) -> slice:
+        """Rows of the network that are loops."""
+        return slice(len(self.runs), None)
+
     @cached_property
     def inside(self) -> tuple[Ints, Ints]:
         """Positions (K,) that the steps of runs lead to, and the run of each, ascending."""
@@ -222,9 +232,14 @@ class Fit:
         return loops_at(self.linear.chain, self.linear.poses, self.reduced.active)
 
     @cached_property
-    def precision(self) -> Floats:
+    def covariance(self) -> Floats:
         """Of the runs and the active loops (S + L, p, p)."""
-        return inverse(np.concatenate([self.runs, self.loops[1]]))
+        return np.concatenate([self.runs, self.loops[1]])
+
+    @cached_property
+    def precision(self) -> Floats:
+        """The inverse (S + L, p, p) of these."""
+        return inverse(self.covariance)
 
     @cached_property
     def residual(self) -> Floats:
@@ -260,6 +275,14 @@ class Fit:
     def log_det(self) -> float:
         """The logarithm of the determinant of the covariance of all active loops' closing errors together."""
         return self.factor.log_det - float(np.linalg.slogdet(self.precision)[1].sum())
+
+    def left_out(self, rows: slice) -> tuple[Floats, Floats]:
+        """Residuals (K, p) of these runs or active loops at poses solved without each, `V S⁻¹ r` with the covariances V
+        there and S of r, and V (K, p, p).
+        """
+        own = self.covariance[rows]
+        there = _without(own, self.factor.across()[rows])
+        return (there @ np.linalg.solve(own, self.residual[rows, :, None]))[..., 0], there
 
     def moves(self) -> tuple[Floats, float]:
         """The Gauss–Newton move (R, p) of the ends, about the world's origin, and how much of χ² it should win."""
@@ -355,7 +378,7 @@ def from_rotations(bare: Fit, steps: int) -> Linear:
 LEAST_LEFT = 1e-6
 
 
-def without(own: Floats, across: Floats) -> Floats:
+def _without(own: Floats, across: Floats) -> Floats:
     """`S (S − K)⁻¹ S` for the covariances S of edges and K of the same motions with all edges, S among them."""
     factor = root(own)
     inverse = np.linalg.inv(factor)
@@ -363,13 +386,3 @@ def without(own: Floats, across: Floats) -> Floats:
     left = np.maximum(1 - values, LEAST_LEFT)
     wide = factor @ vectors
     return np.asarray((wide / left[:, None]) @ np.swapaxes(wide, 1, 2))
-
-
-def without_run(fit: Fit) -> tuple[Floats, Floats, Floats]:
-    """The residual (S, p) of each run at poses solved without it, its covariance (S, p, p), and that part of it which
-    is of these poses.
-    """
-    own = fit.runs
-    total = without(own, fit.factor.across()[: len(own)])
-    ahead = np.linalg.solve(own, fit.residual[: len(own), :, None])
-    return (total @ ahead)[..., 0], total, total - own

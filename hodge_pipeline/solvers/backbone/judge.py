@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline.solvers.backbone.evidence import Wrong, student
-from hodge_pipeline.solvers.backbone.fit import Fit, Linear, root, without
+from hodge_pipeline.solvers.backbone.fit import Fit, Linear, root
 from hodge_pipeline.types import Floats, Ints
 
 SAMPLES = 64
@@ -30,7 +30,8 @@ def judge(linear: Linear, fit: Fit | None, shares: Floats, wrong: Wrong) -> Judg
     """The loops at a fit, or at the bare chain."""
     covariance, residual = uncertainty(linear, fit), linear.loops[0].copy()
     if fit is not None and len(fit.reduced.active):
-        residual[fit.reduced.active], covariance[fit.reduced.active] = left_out(fit)
+        active = fit.reduced.active
+        residual[active], covariance[active] = fit.left_out(fit.reduced.of_loops)
     known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
     log_density = np.zeros((2, len(covariance)))
     chi2 = np.full(len(covariance), np.nan)
@@ -39,15 +40,6 @@ def judge(linear: Linear, fit: Fit | None, shares: Floats, wrong: Wrong) -> Judg
     log_density[1, known] = wrong.log_density(linear.chain, known, at_hand, covariance[known])
     factor = log_density[0] - log_density[1]
     return Judged(factor + np.log(shares[0] / shares[1]), factor, chi2, log_density)
-
-
-def left_out(fit: Fit) -> tuple[Floats, Floats]:
-    """Residuals (L, p) of the active loops at poses solved without each, `V S⁻¹ r` with the covariances V there and S
-    of r, and V (L, p, p).
-    """
-    residual, own = fit.loops
-    covariance = without(own, fit.factor.across()[len(fit.reduced.runs) :])
-    return np.asarray((covariance @ np.linalg.solve(own, residual[..., None]))[..., 0]), covariance
 
 
 def uncertainty(linear: Linear, fit: Fit | None) -> Floats:

@@ -18,7 +18,7 @@ from hodge_pipeline.solvers.backbone.breaks import Testimony
 from hodge_pipeline.solvers.backbone.chain import loops_at_place, one_of_each_place
 from hodge_pipeline.solvers.backbone.evidence import EVEN, Wrong, log_student, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, settled, thinned
-from hodge_pipeline.solvers.backbone.judge import Judged, by_path, judge, left_out
+from hodge_pipeline.solvers.backbone.judge import Judged, by_path, judge
 from hodge_pipeline.solvers.backbone.scales import decoys
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -199,7 +199,7 @@ class Places:
             return out
         if found.right.sum() > 1:
             active = np.searchsorted(self.loop, found.fit.reduced.active)
-            residual, covariance = left_out(found.fit)
+            residual, covariance = found.fit.left_out(found.fit.reduced.of_loops)
             log_density, chi2 = student(residual, covariance)
             worth = log_density - self._away(found.fit) - self.rivals(found.right)[active] + np.log(MISTAKEN_PLACES)
             bent = np.argsort(-chi2, kind="stable")

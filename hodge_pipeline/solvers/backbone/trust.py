@@ -25,6 +25,7 @@ from hodge_pipeline.solvers.backbone.polish import LOCAL
 from hodge_pipeline.solvers.backbone.step_tests import LOOPS_AT_A_STEP, agreeing_loops, is_tested
 from hodge_pipeline.solvers.backbone.window import windowed
 from hodge_pipeline.solvers.maximum_likelihood import solve
+from hodge_pipeline.solvers.weights import dimension_of
 from hodge_pipeline.types import Bools, Floats, ViewGraph
 from hodge_pipeline.types.text import counted
 
@@ -122,6 +123,7 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
     """
     if trust == NONE or not graph.edge_count:
         return None
+    graph = replace(graph, dimension=dimension_of(graph))
     again = consecutive_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
     one = fused(graph, again)
     one = windowed(one) if trust in (AUTO, SEQUENTIAL) else one
