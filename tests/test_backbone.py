@@ -169,7 +169,7 @@ def test_a_covariance_that_sums_left_indefinite_has_a_root() -> None:
 @pytest.mark.parametrize("share", [0.6, 1.0])
 def test_random_motions_between_places_seen_again_are_not_used(share: float, data_dir: Path) -> None:
     """The first 500 poses of INTEL: 30 loops join each two places, of which a few agree by chance, 1.9 times as far off
-    as the odometry. Of the 80 that are right none is lost where the others are wrong.
+    as the odometry. Of the 87 that are right none is lost where the others are wrong.
     """
     whole = read_graph(data_dir / "pose_graphs/sesync/intel.g2o").graph
     assert whole is not None

@@ -50,7 +50,6 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     and edges that name no vertex.
     """
     check_graph(graph)
-    graph = replace(graph, dimension=dimension_of(graph))
     found = backbone_or_diagnosis(graph, options)
     return found if isinstance(found, Diagnosis) else judged_on_backbone(graph, found)
 
@@ -59,6 +58,7 @@ def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbo
     """The backbone of a graph that has one, else the diagnosis that trusts no edge, as of a room of which every pair of
     views was tried.
     """
+    graph = replace(graph, dimension=dimension_of(graph))
     if options.trust == AUTO and every_pair_tried(vertex_ranks(graph)[graph.edges], graph.vertex_count):
         return _ByCycles.of(graph, options).found
     backbone = find_backbone(graph, options.trust)

@@ -54,7 +54,7 @@ def solve_robust(
     check_choice("objective", objective, ObjectiveName)
     start = None if start is None else np.asarray(start, float)
     check_graph(graph, start)
-    found = backbone_or_diagnosis(replace(graph, dimension=dimension_of(graph)), diagnosis)
+    found = backbone_or_diagnosis(graph, diagnosis)
     fixed, unheld = held_rows(graph, start)
 
     def solved(chosen: ViewGraph, poses: Floats) -> Solution:

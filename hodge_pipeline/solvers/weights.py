@@ -43,8 +43,10 @@ def dimension_of(graph: ViewGraph) -> Literal[2, 3]:
     """How many dimensions the frames move in: two also where every edge of a graph in space lies in the plane z = 0 and
     has no information out of it, as of one that was lifted.
     """
-    if graph.dimension == 2 or not graph.edge_count:
-        return 2 if graph.dimension == 2 else 3
+    if graph.dimension == 2:
+        return 2
+    if not graph.edge_count:
+        return 3
     motion = graph.i_from_j
     off = np.abs(np.concatenate([motion[:, 2, :2], motion[:, :2, 2], motion[:, 2:3, 3]], axis=1)).max()
     return 2 if off < PLANAR_TOLERANCE and not graph.information[:, OUT_OF_PLANE].any() else 3

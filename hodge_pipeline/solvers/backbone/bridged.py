@@ -64,7 +64,7 @@ def infer_bridged(chain: Chain, always: Bools, thin: bool, most: int = MOST_BREA
             break
         chain, found = better
     # where nothing confirms the loops, nor is a break confirmed that they speak of
-    for one, other in ((chain, found), (unbroken, first)):
+    for one, other in [(chain, found)] if found is first else [(chain, found), (unbroken, first)]:
         if other.confirmed and not (_contradicted(other) and _found_by_chance(one, other, always, judge)):
             return one, other
     return unbroken, refused(first, always)
