@@ -12,8 +12,8 @@
     python -m benchmarks.wrong_loops sessions --seed 1   # walks cut into two to five sessions that loops alone join
 
 Errors are metres RMS of positions after a rigid fit: to the truth, or for graphs of the literature to their own
-solution without the injected loops. WORSE: than 1.02 × the odometry. `--only WORD` takes the graphs whose name has
-the word.
+solution without the injected loops. WORSE: than 1.02 × the odometry, each path of it fitted by itself, since nothing
+says where paths lie that no loop joins. `--only WORD` takes the graphs whose name has the word.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from simulated_edges import between
 from slam_loops import BICOCCA_M, ROBOTCAR_M, SHARED, bicocca, odometry, position_error, robotcar
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.refine.pose_graph import read_graph
@@ -399,18 +400,29 @@ def main() -> None:
         before = time.process_time()
         found = diagnose(case.graph)
         seconds = time.process_time() - before
-        error = position_error(found.world_from_cam[:, :3, 3], case.places)
-        bare = position_error(odometry(case.graph)[:, :3, 3], case.places)
+        chain = odometry(case.graph)
+        error, bare = (position_error(poses[:, :3, 3], case.places) for poses in (found.world_from_cam, chain))
         alone = right_alone(case)
         false, lost = int((found.kept & ~case.right).sum()), int((~found.kept & case.right).sum())
         total, kept, blamed = total + seconds, kept + false, blamed + lost
-        bad = error > MORE * bare
+        bad = by_path(found.world_from_cam, case) > MORE * by_path(chain, case)
         worse += bad
         wrong = int((~case.right).sum())
         cells = case.name, f"{len(case.right)}, {wrong}", f"{bare:.2f}", f"{alone:.2f}", f"{error:.2f}"
         print(" | ".join((*cells, f"{false}, {lost}", f"{seconds:.1f}")), "WORSE" if bad else "", flush=True)
     counts = f"{kept} wrong edges kept, {blamed} right ones not"
     print(f"{len(cases)} graphs, {total:.0f} CPU s; {counts}; {worse} worse than the odometry")
+
+
+def by_path(poses: Floats, case: Case) -> float:
+    """The error of poses (V, 4, 4) with each path of the consecutive edges fitted to the truth by itself."""
+    path = connected_components(case.graph.edges[steps(case.graph)], case.graph.vertex_count)
+    path = np.where(np.isfinite(case.places[:, 0]), path, -1)
+    squares = 0.0
+    for rows in (np.flatnonzero(path == number) for number in range(path.max() + 1)):
+        if len(rows) > 1:
+            squares += len(rows) * position_error(poses[rows, :3, 3], case.places[rows]) ** 2
+    return float(np.sqrt(squares / (path >= 0).sum()))
 
 
 def right_alone(case: Case) -> float:

@@ -111,10 +111,10 @@ def _better(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]
 
 def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
     """Breaks worth a trial, with what each must win beside what it has won."""
-    linear, (right, wrong) = found.start, found.judged.log_density
-    shares = np.log(mixture(found.judged.log_density)[0])
-    told = Testimony(linear.chain, linear, np.logaddexp(shares[0] + right - wrong, shares[1]), wrong, found.used)
-    usual, least, fold = Usual.of(chain), by_chance(len(right)), np.log(max(told.testimonies(), 1))
+    linear, factor = found.start, found.judged.factor
+    shares = np.log(mixture(factor)[0])
+    told = Testimony(linear.chain, linear, np.logaddexp(shares[0] + factor, shares[1]), found.judged.wrong, found.used)
+    usual, least, fold = Usual.of(chain), by_chance(len(factor)), np.log(max(told.testimonies(), 1))
     agreed = [each for each in agreed_breaks(told, usual) if each.log_evidence > BY_CHANCE + fold]
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
     worth = [(each, least) for each in agreed[:MOST_TRIED] if each is agreed[0] or each.at != agreed[0].at]
@@ -147,7 +147,7 @@ def joined(chain: Chain) -> Chain:
         scales, shares = learned = learned or learn_scales(chain, wrong)
         linear, rows = linearise(scales.applied(chain), poses), np.arange(len(chain.ends))
         covariance = by_path(linear, rows)
-        away = wrong.log_density(linear.chain, rows, linear.loops[0], covariance)
+        away = wrong.at(linear.chain, rows, linear.loops[0]).log_density(covariance)
         told, pairs = Testimony.of(linear, away), chain.path[chain.ends]
         apart = pairs[:, 0] != pairs[:, 1]
         refuted = np.flatnonzero(~apart & (student(linear.loops[0], covariance)[0] < away))

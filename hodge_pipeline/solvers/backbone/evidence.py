@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.special import gammaln
 
 from hodge_pipeline import se3
@@ -41,18 +42,34 @@ class Wrong:
             shapes.append(_shape(chain, poses, near, rng) if len(near) >= FEWEST_PAIRS else shapes[0])
         return cls(*np.linalg.eigh(np.stack(shapes[::-1])))
 
-    def log_density(self, chain: Chain, rows: Ints, residual: Floats, covariance: Floats) -> Floats:
-        """Of these loops (K,), with their residuals (K, p) and the covariances (K, p, p) that these have of right ones:
-        along an axis in which places hardly differ a wrong loop is as far off as a right one.
-        """
+    def at(self, chain: Chain, rows: Ints, residual: Floats) -> WrongLoops:
+        """Where these loops (K,) with residuals (K, p) end if they are wrong."""
         a, b = chain.ends[rows].T
-        apart, size = chain.path[a] != chain.path[b], residual.shape[1]
+        apart = chain.path[a] != chain.path[b]
         octave = np.minimum(np.log2(np.maximum(b - a, 1)).astype(np.int64), len(self.spread) - 1)
         octave[apart] = len(self.spread) - 1
         along = np.swapaxes(self.axes, 1, 2)[octave]
-        shape = np.maximum(self.spread[octave], ((along @ covariance) * along).sum(axis=2))
-        chi2 = ((along @ residual[:, :, None])[..., 0] ** 2 / shape).sum(axis=1)
-        chi2[apart] = size  # how two paths lie is not known
+        return WrongLoops(along, self.spread[octave], (along @ residual[:, :, None])[..., 0] ** 2, apart)
+
+
+@dataclass(frozen=True)
+class WrongLoops:
+    """Residuals of loops if these are wrong, squared (K, p), and the `spread (K, p)` of their distribution, `along
+    (K, p, p)` its axes, in rows; `apart (K,)`: between two paths.
+    """
+
+    along: Floats
+    spread: Floats
+    squared: Floats
+    apart: Bools
+
+    def log_density(self, covariance: Floats) -> Floats:
+        """Where right loops have such covariances (K, p, p): along an axis in which places hardly differ a wrong loop
+        is as far off as a right one.
+        """
+        shape = np.maximum(self.spread, ((self.along @ covariance) * self.along).sum(axis=2))
+        chi2, size = (self.squared / shape).sum(axis=1), shape.shape[1]
+        chi2[self.apart] = size  # how two paths lie is not known
         return np.asarray(log_student(chi2, size, freedom=1.0) - 0.5 * np.log(shape).sum(axis=1))
 
 
@@ -110,13 +127,19 @@ EVEN, LEAST_SHARE = np.full(2, 0.5), 1e-3
 """The shares of right and wrong loops before any is looked at, and the least that a class is given."""
 
 
-def mixture(log_densities: Floats) -> tuple[Floats, float]:
-    """The shares (k,) of classes with these log-densities (k, M) that are likeliest, and the log-likelihood."""
-    shares, top = np.full(len(log_densities), 1 / len(log_densities)), log_densities.max(axis=0)
-    density = np.exp(log_densities - top)
-    for _ in range(30):
-        total = shares @ density
-        weight = shares * (density @ (1 / total)) + 0.5
-        shares = np.maximum(weight / weight.sum(), LEAST_SHARE)
-        shares /= shares.sum()
-    return shares, float((np.log(total) + top).sum())
+LARGEST = 700.0
+"""Nats beyond which a loop is right with any share: their exponential is a number yet."""
+
+
+def mixture(factor: Floats) -> tuple[Floats, float]:
+    """The shares of right and wrong loops that are likeliest with these log Bayes factors (M,), half a loop of each
+    counted beforehand; and the log-likelihood of the loops then, against all being wrong.
+    """
+    gain = np.expm1(np.minimum(factor, LARGEST))
+
+    def slope(right: float) -> float:  # of the log-likelihood, which is concave
+        return float((gain / (1 + right * gain)).sum()) + 0.5 / right - 0.5 / (1 - right)
+
+    least, most = LEAST_SHARE, 1 - LEAST_SHARE
+    right = least if slope(least) <= 0 else most if slope(most) >= 0 else brentq(slope, least, most, xtol=1e-6)
+    return np.array([right, 1 - right]), float(np.logaddexp(np.log(right) + factor, np.log1p(-right)).sum())

@@ -111,7 +111,7 @@ class _Trial:
         # wrong loops may have led into a valley that the right ones do not leave
         fit = min((settled(Fit(reduced, begun), MOST_STEPS) for begun in (linear, start)), key=_cost)
         judged = judge(fit.linear, fit, shares, self.wrong)
-        shares, top = _mixed(judged)
+        shares, top = mixture(judged.factor)
         used &= (judged.log_odds > 0) | always
         if np.log(shares[0] / shares[1]) < MISTAKEN:
             used &= ~_lone(chain, used) | always
@@ -168,7 +168,7 @@ class _Trial:
             return None
         fit = settled(Fit(reduced, linear), MOST_STEPS)
         judged = judge(fit.linear, fit, shares, self.wrong)
-        shares, _ = _mixed(judged)
+        shares, _ = mixture(judged.factor)
         each = np.logaddexp(np.log(shares[0]) + judged.factor, np.log(shares[1]))
         return float(self.testimony @ each), np.minimum(judged.factor, judged.log_odds), shares, fit.linear
 
@@ -190,7 +190,7 @@ class _Trial:
                 fit = min(fit, other, key=_cost)
             linear = fit.linear
             judged = judge(linear, fit, shares, self.wrong)
-            shares, likelihood = _mixed(judged)
+            shares, likelihood = mixture(judged.factor)
             if likelihood > top:
                 best, top = (judged, linear), likelihood
             used = (judged.log_odds > 0) & (judged.factor > 0) | self.always
@@ -213,12 +213,6 @@ REARRANGED = 3
 """Times that the loops are judged, at first and after places were left out or added: a limit on cost."""
 MOST_GROWN = 30
 """Rounds in which loops are added: a limit on cost."""
-
-
-def _mixed(judged: Judged) -> tuple[Floats, float]:
-    """The likeliest shares of right and wrong loops, and the log-likelihood against all being wrong."""
-    shares, likelihood = mixture(judged.log_density)
-    return shares, likelihood - float(judged.log_density[1].sum())
 
 
 def _cost(fit: Fit) -> float:

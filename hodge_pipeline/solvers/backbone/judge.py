@@ -16,14 +16,14 @@ SAMPLES = 64
 @dataclass(frozen=True)
 class Judged:
     """Loops judged at some poses: `log_odds (M,)` that each is right, by all others; `factor (M,)` its log Bayes factor
-    without the share of right ones; `chi2 (M,)` of its residual at poses solved without it; `log_density
-    (2, M)` of it, right and wrong.
+    without the share of right ones; `chi2 (M,)` of its residual at poses solved without it; `wrong (M,)`: the
+    log-density of its residual at hand if it is wrong.
     """
 
     log_odds: Floats
     factor: Floats
     chi2: Floats
-    log_density: Floats
+    wrong: Floats
 
 
 def judge(linear: Linear, fit: Fit | None, shares: Floats, wrong: Wrong) -> Judged:
@@ -33,13 +33,10 @@ def judge(linear: Linear, fit: Fit | None, shares: Floats, wrong: Wrong) -> Judg
         active = fit.reduced.active
         residual[active], covariance[active] = fit.left_out(fit.reduced.of_loops)
     known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
-    log_density = np.zeros((2, len(covariance)))
-    chi2 = np.full(len(covariance), np.nan)
-    log_density[0, known], chi2[known] = student(residual[known], covariance[known])
-    at_hand = linear.loops[0][known]
-    log_density[1, known] = wrong.log_density(linear.chain, known, at_hand, covariance[known])
-    factor = log_density[0] - log_density[1]
-    return Judged(factor + np.log(shares[0] / shares[1]), factor, chi2, log_density)
+    (right, away), chi2 = np.zeros((2, len(covariance))), np.full(len(covariance), np.nan)
+    right[known], chi2[known] = student(residual[known], covariance[known])
+    away[known] = wrong.at(linear.chain, known, linear.loops[0][known]).log_density(covariance[known])
+    return Judged(right - away + np.log(shares[0] / shares[1]), right - away, chi2, away)
 
 
 def uncertainty(linear: Linear, fit: Fit | None) -> Floats:

@@ -93,7 +93,7 @@ class Places:
             run = _cut(connected_components(adjacent, len(place)), ends[place])
         by_size = np.lexsort((-loops, run))
         first = by_size[np.unique(run[by_size], return_index=True)[1]]
-        groups = agreeing_groups(Testimony.of(start, alone.log_density[1]), np.flatnonzero(distance > 1.0))
+        groups = agreeing_groups(Testimony.of(start, alone.wrong), np.flatnonzero(distance > 1.0))
         usual = np.median(loops[first])
         may_be_added = np.array([len(group) >= usual and alone.factor[group[0]] > 0 for group in groups], bool)
         may_be_added[MOST_TRIED:] = False
@@ -156,7 +156,7 @@ class Places:
     def _away(self, fit: Fit) -> Floats:
         """The log-density (L,) of each active loop if it is wrong."""
         rows = fit.reduced.active
-        return self.wrong.log_density(self.start.chain, rows, fit.loops[0], by_path(self.start, rows))
+        return self.wrong.at(self.start.chain, rows, fit.loops[0]).log_density(by_path(self.start, rows))
 
     def best(self, linear: Linear, enough: float) -> tuple[Arrangement, bool]:
         """The likeliest arrangement, from that of all used places on, whose poses are near `linear`, and whether its

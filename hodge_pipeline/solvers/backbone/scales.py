@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from hodge_pipeline.solvers.backbone.breaks import Testimony
 from hodge_pipeline.solvers.backbone.chain import MOST_OF_A_STEP, Chain
-from hodge_pipeline.solvers.backbone.evidence import EVEN, Wrong, mixture, student, turns
+from hodge_pipeline.solvers.backbone.evidence import EVEN, Wrong, WrongLoops, mixture, student, turns
 from hodge_pipeline.solvers.backbone.fit import linearise
 from hodge_pipeline.types import Floats, Ints
 
@@ -188,12 +188,11 @@ def _some(rows: Ints) -> Ints:
 @dataclass(frozen=True)
 class _Model:
     """Residuals (M, p) of cycles of one loop or two, with the covariances of their paths and of their loops as parts
-    (3, M, p, p): of rotation, of translation, and of both together; `fixed (M, p, p)`: what no scale changes. The loops
-    of the chain are the cycles' own.
+    (3, M, p, p): of rotation, of translation, and of both together; `fixed (M, p, p)`: what no scale changes; `away`:
+    the same if the loops are wrong.
     """
 
-    chain: Chain
-    wrong: Wrong
+    away: WrongLoops
     residual: Floats
     fixed: Floats
     path: Floats
@@ -201,16 +200,23 @@ class _Model:
 
     @classmethod
     def of(
-        cls, chain: Chain, wrong: Wrong, residual: Floats, parted: Callable[[Chain], tuple[Floats, Floats]]
+        cls,
+        chain: Chain,
+        wrong: Wrong,
+        rows: Ints,
+        residual: Floats,
+        parted: Callable[[Chain], tuple[Floats, Floats]],
     ) -> _Model:
-        """`parted` gives the covariances of the paths and of the loops where the chain has some errors."""
+        """`rows (M,)`: the loops of the chain whose cycles these are; `parted` gives the covariances of paths and loops
+        where the chain has some errors.
+        """
         kinds = (0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)
         parts = [parted(Scales(*kind, *kind).applied(chain)) for kind in kinds]
         path, own = (np.stack(each) for each in zip(*parts, strict=True))
         fixed, path, own = path[0], path[1:] - path[0], own[1:]
         for each in (path, own):
             each[2] -= each[0] + each[1]
-        return cls(chain, wrong, residual, fixed, path, own)
+        return cls(wrong.at(chain, rows, residual), residual, fixed, path, own)
 
     @classmethod
     def within(cls, chain: Chain, poses: Floats, wrong: Wrong) -> _Model:
@@ -221,7 +227,7 @@ class _Model:
             part = replace(linear, chain=scaled)
             return part.path(*chain.ends.T), part.loops[1]
 
-        return cls.of(chain, wrong, linear.loops[0], parted)
+        return cls.of(chain, wrong, np.arange(len(chain.ends)), linear.loops[0], parted)
 
     @classmethod
     def beside(
@@ -242,14 +248,12 @@ class _Model:
             path = told(replace(scaled, covariance=0 * scaled.covariance))[1]
             return path, told(scaled)[1] - path
 
-        found = cls.of(chain, wrong, told(chain)[0], parted)
-        return replace(found, chain=chain.with_loops(first, chain.ends[first]))
+        return cls.of(chain, wrong, first, told(chain)[0], parted)
 
     def select(self, rows: slice) -> _Model:
         """That of these cycles."""
-        chosen = self.chain.with_loops(np.arange(len(self.residual))[rows], self.chain.ends[rows])
-        parts = self.residual[rows], self.fixed[rows], self.path[:, rows], self.own[:, rows]
-        return _Model(chosen, self.wrong, *parts)
+        away = WrongLoops(self.away.along[rows], self.away.spread[rows], self.away.squared[rows], self.away.apart[rows])
+        return _Model(away, self.residual[rows], self.fixed[rows], self.path[:, rows], self.own[:, rows])
 
     def value(self, logs: Floats) -> tuple[float, Floats]:
         """The log-likelihood of scales, against all loops being wrong, and the shares of right and wrong loops."""
@@ -257,10 +261,8 @@ class _Model:
             return 0.0, EVEN
         turn, shift, own_turn, own_shift = np.exp(logs)
         covariance = self.fixed + _weighed(self.path, turn, shift) + _weighed(self.own, own_turn, own_shift)
-        rows = np.arange(len(self.residual))
-        away = self.wrong.log_density(self.chain, rows, self.residual, covariance)
-        factor = student(self.residual, covariance)[0] - away
-        shares, likelihood = mixture(np.stack([factor, np.zeros_like(factor)]))
+        factor = student(self.residual, covariance)[0] - self.away.log_density(covariance)
+        shares, likelihood = mixture(factor)
         return likelihood, shares
 
 
