@@ -133,9 +133,12 @@ def picture(rng: np.random.Generator) -> Floats:
     image = _mix(np.clip(0.6 * row + 0.4 * _clouds(rng, 1.6), 0, 1), tuple(first), tuple(second))
     for _ in range(30):
         at_row, at_column, size = rng.uniform(0.05, 0.95), rng.uniform(0.05, 0.95), rng.uniform(0.03, 0.14)
-        disc = np.hypot(row - at_row, column - at_column) < size
-        slab = (np.abs(row - at_row) < size) & (np.abs(column - at_column) < size * rng.uniform(0.2, 1.5))
-        image[disc if rng.random() < 0.5 else slab] = rng.uniform(0.05, 0.95, 3)
+        width, colour = size * rng.uniform(0.2, 1.5), rng.uniform(0.05, 0.95, 3)
+        if rng.random() < 0.5:
+            inside = np.hypot(row - at_row, column - at_column) < size
+        else:
+            inside = (np.abs(row - at_row) < size) & (np.abs(column - at_column) < width)
+        image[inside] = colour
     mount = np.minimum(np.minimum(row, 1 - row), np.minimum(column, 1 - column)) < 0.07
     image[mount] = 0.93
     return image

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +55,12 @@ def read(path: Path) -> Document:
 
 def parse(text: str, name: str) -> Document:
     """The mapping in a YAML text; `name` stands for the file in origins and errors."""
+    document = _parsed(text, name)
+    return Document(deepcopy(document.data), dict(document.origins))
+
+
+@lru_cache(maxsize=16)  # every use of a run reads its recipe, which takes 40 ms
+def _parsed(text: str, name: str) -> Document:
     try:
         yaml = YAML(typ="rt", pure=True)
         yaml.max_depth = MAX_DEPTH + 1  # a value lies one level below what it is in

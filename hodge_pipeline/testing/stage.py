@@ -16,8 +16,8 @@ from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats, Floats32, Fram
 Case = TypeVar("Case")
 IS_A_STAGE = "is a stage"
 
-FRAMES, TURNS, WIDTH, HEIGHT = 12, 0.02, 320, 240
-"""Neighbours are up to 4 cm and 2 degrees apart; the camera goes there and back."""
+FRAMES, TURNS, WIDTH, HEIGHT = 8, 0.02, 320, 240
+"""Neighbours are up to 6 cm and 4 degrees apart; the camera goes there and back."""
 CLOUD_VOXEL_M, LANDMARKS = 0.04, 500
 
 
