@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from benchmarks.edge_scores import precision_and_recall
-from diagnosis_graphs import every_pair_tried, measured, poses_on_a_ring, spoiled
+from diagnosis_graphs import every_pair_tried, measured, near_pairs, poses_on_a_ring, spoiled
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.evidence import order_prior, prior_by_cycles
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.scene_model import Joining, learn_joining
 from hodge_pipeline.types import Floats
 
@@ -75,3 +76,23 @@ def test_a_wrong_step_between_consecutive_views_does_not_outvote_the_loops() -> 
     relative = se3.inverse(found.world_from_cam[i]) @ found.world_from_cam[j]
     left = relative[:, :3, 3] - (se3.inverse(poses[i]) @ poses[j])[:, :3, 3]
     assert (np.linalg.norm(left, axis=1) < 0.3).mean() > 0.95
+
+
+def test_edges_that_repeat_or_join_a_vertex_to_itself_tell_nothing_of_the_order() -> None:
+    """One of the latter a vertex took a graph without an order for a sequence: priors from .05 to .98."""
+    rng, count = np.random.default_rng(0), 60
+    pairs = np.stack(np.triu_indices(count, 1), axis=1)
+    edges = pairs[rng.random(len(pairs)) < 0.3]
+    near = edges[np.diff(edges, axis=1)[:, 0] <= 4]
+    own = np.repeat(np.arange(count), 2).reshape(-1, 2)
+    for more in (own, np.repeat(near, 4, axis=0)):
+        prior = order_prior(np.concatenate([edges, more]), count)[: len(edges)]
+        np.testing.assert_array_equal(prior, order_prior(edges, count))
+
+
+def test_unknown_information_is_unknown_of_half_angles_too() -> None:
+    graph, _ = spoiled(measured(poses_on_a_ring(40), near_pairs(40, 3), 0, noise=3), np.arange(0, 120, 4), 0)
+    halves = replace(graph, information=np.tile(np.diag([0.25] * 3 + [1.0] * 3), (120, 1, 1)))
+    whole = replace(graph, information=np.tile(np.eye(6), (120, 1, 1)))
+    found, other = (diagnose(each, DiagnosisOptions(trust="none")) for each in (whole, halves))
+    np.testing.assert_array_equal(found.probability, other.probability)

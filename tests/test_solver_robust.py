@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from diagnosis_graphs import SIGMA, measured, near_pairs, poses_on_a_ring
 from hodge_pipeline import open_source, se3
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
@@ -11,7 +12,7 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.covariance import marginal_covariances, relative_covariances
 from hodge_pipeline.solvers.maximum_likelihood import MaximumLikelihoodSolver, solve
 from hodge_pipeline.stages import ConsistencySolver
-from hodge_pipeline.types import ViewGraph
+from hodge_pipeline.types import Priors, ViewGraph
 
 SIGMA_RAD, SIGMA_M = 0.01, 0.02
 
@@ -298,3 +299,34 @@ def test_random_loops_in_a_large_lattice_are_left_out(data_dir: Path) -> None:
     )
     kept = solve_robust(spoiled).weights > 0
     assert kept[: graph.edge_count].all() and not kept[graph.edge_count :].any()
+
+
+def ring_of_three(stated: float = 1.0) -> tuple[ViewGraph, np.ndarray]:
+    """Forty poses, each joined to the next three, with `stated` times the errors that they have; and the true poses."""
+    truth = poses_on_a_ring(40)
+    graph = measured(truth, near_pairs(40, 3), 1)
+    information = np.tile(np.diag((stated * SIGMA) ** -2), (graph.edge_count, 1, 1))
+    return dataclasses.replace(graph, information=information), truth
+
+
+@pytest.mark.parametrize("known", ["priors", "fixed"])
+def test_right_edges_count_in_full_whatever_else_is_known(known: str) -> None:
+    """Of 120 right edges 45 to 49 were weighed less: the freedom of what χ² is judged by was miscounted."""
+    graph, truth = ring_of_three()
+    if known == "priors":
+        sigma = np.full(6, 0.05)
+        poses = truth @ se3.exp(np.random.default_rng(3).normal(size=(40, 6)) * sigma)
+        graph = dataclasses.replace(graph, priors=Priors(np.arange(40), poses, np.tile(np.diag(sigma**-2), (40, 1, 1))))
+    else:
+        graph = dataclasses.replace(graph, fixed=np.arange(39))
+    assert (solve_robust(graph, start=truth, diagnosis=DiagnosisOptions(trust="none")).weights == 1).all()
+
+
+def test_edges_from_a_vertex_to_itself_hide_no_larger_errors() -> None:
+    graph, _ = ring_of_three(stated=0.5)
+    nothing = np.tile(np.eye(4), (2000, 1, 1))
+    own = ViewGraph.from_edges(graph.vertex_ids, np.zeros((2000, 2), int), nothing, graph.information[[0] * 2000])
+    options = DiagnosisOptions(trust="none")
+    alone, found = (solve_robust(each, diagnosis=options).weights for each in (graph, ViewGraph.joined([graph, own])))
+    assert (alone < 0.9).any()
+    np.testing.assert_allclose(found[:120], alone, atol=1e-6)

@@ -79,6 +79,12 @@ class OrientedEdges:
     row: Ints
     sign: Ints
 
+    @property
+    def first(self) -> Ints:
+        """The first measured edge (N,) of each."""
+        real = np.flatnonzero(self.row >= 0)
+        return np.asarray(real[np.unique(self.row[real], return_index=True)[1]])
+
     def pooled(self, omega: Floats, weights: Floats) -> tuple[Floats, Floats]:
         """The weighted mean (N, k) of the 1-form over parallel edges, in the simple graph's direction, and their total
         weight (N,).

@@ -28,12 +28,11 @@ TRIANGLES_PER_EDGE = 8
 """Of which all but the first that holds an edge are the same evidence again."""
 
 
-def cycle_errors(loops: Loops, i_from_j: Floats, products: Floats | None = None) -> tuple[Floats, Floats]:
+def cycle_errors(loops: Loops, i_from_j: Floats) -> tuple[Floats, Floats]:
     """The angle (L,) in radians and the displacement (L,) in metres that the product of motions along each cycle
-    leaves, the latter at the middle of the cycle's frames; `products (L, 4, 4)` where they are known.
+    leaves, the latter at the middle of the cycle's frames.
     """
-    products = loop_products(loops, i_from_j) if products is None else products
-    middle = _middles(loops, i_from_j)
+    products, middle = loop_products(loops, i_from_j), _middles(loops, i_from_j)
     displacement_m = np.einsum("lij,lj->li", products[:, :3, :3], middle) + products[:, :3, 3] - middle
     return np.linalg.norm(se3.so3_log(products[:, :3, :3]), axis=1), np.linalg.norm(displacement_m, axis=1)
 

@@ -48,7 +48,8 @@ def unfilled_loops(
     first = 0 if most_loops is None else max(0, len(open_ranks) - most_loops)
     chords = forest.chords[by_length[np.array(open_ranks[first:], np.int64)]]
     loops = fundamental_loops(forest, chords)
-    return Holes(len(open_ranks), _over_measured(loops, oriented.row, oriented.sign, len(oriented.edges)))
+    measured = oriented.first[loops.edge]
+    return Holes(len(open_ranks), Loops(loops.offsets, measured, loops.sign * oriented.sign[measured]))
 
 
 def _lengths(forest: SpanningForest) -> Ints:
@@ -70,12 +71,3 @@ def _filled(triangles: Ints) -> set[int]:
         if left:
             reduced[max(left)] = left
     return set(reduced)
-
-
-def _over_measured(loops: Loops, row: Ints, sign: Ints, count: int) -> Loops:
-    """The loops over the first measured edge of each simple one, passed in that edge's own direction."""
-    first = np.full(count, -1, np.int64)
-    real = np.flatnonzero(row >= 0)[::-1]
-    first[row[real]] = real
-    measured = first[loops.edge]
-    return Loops(loops.offsets, measured, loops.sign * sign[measured])

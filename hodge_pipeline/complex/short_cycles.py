@@ -79,13 +79,11 @@ def _triangles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
 def _along(corners: Ints, edges: Ints, vertex_count: int) -> Loops:
     """The loops that pass corners (N, K) in order along the first of parallel edges, where all are joined."""
     simple = orient_edges(edges, vertex_count)
-    real = np.flatnonzero(simple.row >= 0)
-    measured = real[np.unique(simple.row[real], return_index=True)[1]]
     keys = simple.edges @ [vertex_count, 1]
     sides = np.sort(np.stack([corners, np.roll(corners, -1, axis=1)], axis=2), axis=2) @ [vertex_count, 1]
     place = np.minimum(np.searchsorted(keys, sides), len(keys) - 1)
     joined = (keys[place] == sides).all(axis=1)
-    edge = measured[place[joined]]
+    edge = simple.first[place[joined]]
     return _of_equal_length(edge, np.where(edges[edge, 0] == corners[joined], 1, -1))
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hodge_pipeline.complex.cech import orient_edges
 from hodge_pipeline.complex.closing import cycle_errors
 from hodge_pipeline.complex.short_cycles import short_cycles
 from hodge_pipeline.diagnosis.cycles import Cycles, closing_support, judge_cycles, usual_share
@@ -44,7 +45,8 @@ def order_prior(edges: Ints, vertex_count: int) -> Floats:
     edges and (1 - q) f wrong ones, so q = (r - f) / (1 - f), and an edge between them is right with probability q / r.
     All are equal where neighbours are hardly more often joined than far pairs. Vertex rows are the order.
     """
-    place, bounds = _gap_classes(edges, vertex_count)
+    bounds = _gap_classes(edges, vertex_count)[1]
+    place = _gap_classes(orient_edges(edges, vertex_count).edges, vertex_count)[0]
     joined = np.bincount(place, minlength=len(bounds) - 1)[: len(bounds) - 1]
     pairs = np.array([_pairs(low, high, vertex_count) for low, high in zip(bounds[:-1], bounds[1:], strict=True)])
     rate = np.minimum(joined / np.maximum(pairs, 1), 1.0)
@@ -55,7 +57,7 @@ def order_prior(edges: Ints, vertex_count: int) -> Floats:
         return np.full(len(edges), 0.5)
     right = np.maximum(rate - far, 0) / (1 - far)
     share = np.clip(right / np.maximum(rate, 1e-12), FLOOR, CEILING)
-    return np.asarray(share[place])
+    return np.asarray(share[_gap_classes(edges, vertex_count)[0]])
 
 
 def prior_by_cycles(edges: Ints, vertex_count: int, cycles: Cycles) -> Floats:
@@ -114,7 +116,7 @@ def every_pair_tried(edges: Ints, vertex_count: int) -> bool:
 
 def _far_rate(edges: Ints, vertex_count: int) -> float:
     start = max(int(np.ceil(FAR_SHARE * vertex_count)), 2)
-    far = np.abs(edges[:, 1] - edges[:, 0]) >= start
+    far = np.ptp(orient_edges(edges, vertex_count).edges, axis=1) >= start
     return float(far.sum() / max(_pairs(start, vertex_count, vertex_count), 1))
 
 

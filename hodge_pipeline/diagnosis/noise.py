@@ -80,7 +80,8 @@ def edge_noise(
     within bounds: errors as large as the motions would let any loop close, and errors as small as those of rounding
     none.
     """
-    own, informed = _stated(graph, there)
+    informed, ones = not has_unit_information(graph), np.ones(graph.edge_count)
+    own = [_deviation(each) for each in mean_variances(there, graph.dimension == 2)] if informed else [ones, ones]
     rotation, translation = map(_proportions, own)
     short = np.flatnonzero(loops.lengths <= LONGEST_CYCLE)
     any_cycle, loops = len(loops) > 0, loops.select(short)
@@ -99,7 +100,7 @@ def edge_noise(
         shift = max(shift, LEVER * turn * reach_m)
     taken = turn == believed[0], shift == believed[1]
     changed = any(own and not 1 / TOLD_FROM < by < TOLD_FROM for own, by in zip(taken, believed, strict=True))
-    is_reported = informed and changed and any_cycle and not has_unit_information(graph)
+    is_reported = informed and changed and any_cycle
     doubts = (_doubt(stated, (turn * stated[0], shift * stated[1])),) if is_reported else ()
     return Noise(_scaled(turn, rotation, own[0]), _scaled(shift, translation, own[1]), doubts)
 
@@ -133,17 +134,6 @@ def _doubt(stated: tuple[float, float], taken: tuple[float, float]) -> str:
         "the information states errors that the graph does not show, and too few short cycles close to tell: judged "
         f"with {turn:.2g} times these in rotation, {shift:.2g} times in translation"
     )
-
-
-def _stated(graph: ViewGraph, there: ViewGraph) -> tuple[tuple[Floats, Floats], bool]:
-    """Standard deviations (E,) of rotation and of translation that the information states at the working point, ∞ where
-    it states none; ones where it is the identity for every edge.
-    """
-    same = graph.edge_count < 2 or bool((graph.information == graph.information[:1]).all())
-    if same and (not graph.edge_count or np.array_equal(graph.information[0], np.eye(6))):
-        return (np.ones(graph.edge_count), np.ones(graph.edge_count)), False
-    rotation, translation = mean_variances(there, graph.dimension == 2)
-    return (_deviation(rotation), _deviation(translation)), True
 
 
 def _deviation(variance: Floats) -> Floats:

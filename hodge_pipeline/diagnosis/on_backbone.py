@@ -7,7 +7,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline import se3
 from hodge_pipeline.complex.closing import cycle_errors
 from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.complex.series import series_classes
@@ -48,6 +47,7 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone) -> Diagnosis:
     wrong = ~kept & (probability < WRONG_BELOW) & (refuted | backbone.found.confirmed)
     verdict = np.select([untestable, wrong, kept], [UNTESTABLE, WRONG, CONSISTENT], SUSPECT)
     cycles, cycle = _cycles(graph, backbone, in_loop)
+    witness = np.pad(cycle[:, None], ((0, 0), (0, WITNESSES - 1)), constant_values=-1)
     return Diagnosis.of(
         graph,
         verdict=verdict,
@@ -56,16 +56,10 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone) -> Diagnosis:
         kept=kept,
         network=network,
         cycles=cycles,
-        witnesses=(_witnesses(np.where(kept, cycle, -1)), _witnesses(np.where(kept, -1, cycle))),
+        witnesses=(np.where(kept[:, None], witness, -1), np.where(kept[:, None], -1, witness)),
         world_from_cam=backbone.world_from_cam,
         tested=backbone.note,
     )
-
-
-def _witnesses(cycle: Ints) -> Ints:
-    out = np.full((len(cycle), WITNESSES), -1, np.int64)
-    out[:, 0] = cycle
-    return out
 
 
 def _cycles(graph: ViewGraph, backbone: Backbone, in_loop: Bools) -> tuple[Cycles, Ints]:
@@ -81,8 +75,7 @@ def _cycles(graph: ViewGraph, backbone: Backbone, in_loop: Bools) -> tuple[Cycle
     low, high, chords = low[order], high[order], chain.loop_edge[order]
     onward = graph.edges[chords, 0] == chain.order[low]
     loops = _around(graph, chain, chords, low, high, onward)
-    begin, end = chain.poses[np.where(onward, low, high)], chain.poses[np.where(onward, high, low)]
-    errors = cycle_errors(loops, graph.i_from_j, graph.i_from_j[chords] @ se3.inverse(end) @ begin)
+    errors = cycle_errors(loops, graph.i_from_j)
     row = np.full(graph.edge_count, -1, np.int64)
     row[chords] = np.arange(len(chords))
     return Cycles(loops, *errors, backbone.chi2[chords], backbone.used[chords]), row

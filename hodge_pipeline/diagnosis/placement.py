@@ -110,8 +110,8 @@ class Placements:
         """The log-evidence (P,) of the edge that joins consecutive views; 0 of other pairs."""
         edges, out = self.evidence.graph.edges, np.zeros(len(self.pairs))
         rows = np.flatnonzero(np.abs(edges[:, 1] - edges[:, 0]) == 1)
-        for pair in (self.row[: len(edges)], self.row[len(edges) :]):
-            np.maximum.at(out, pair[rows], consecutive_log_evidence(self.evidence)[rows])
+        sure = consecutive_log_evidence(self.evidence)[rows]
+        np.maximum.at(out, self.row.reshape(2, -1)[:, rows].ravel(), np.tile(sure, 2))
         return out
 
     def _agreeing(self, motion: Floats, moved: Floats) -> Floats:

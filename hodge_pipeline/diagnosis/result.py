@@ -24,7 +24,8 @@ class Diagnosis:
 
     - `verdict (E,)`: consistent, suspect, wrong or untestable; `probability (E,)` that it is right, NaN where
       untestable; `reason`: one line for each edge.
-    - `kept (E,)`: edges that are neither wrong nor suspect.
+    - `kept (E,)`: edges in use: consistent ones, and untestable ones but for those from a vertex to itself and loops
+      that are all that joins two backbones.
     - `residual_m`, `residual_deg (E,)`: against the robust poses; NaN between two pieces.
     - `leverage (E,)`: an edge's share in determining the relative pose of its ends, 1 where removing it splits its
       piece; 0 for one that is not kept.

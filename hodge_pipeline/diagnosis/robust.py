@@ -94,7 +94,8 @@ def _on_backbone(graph: ViewGraph, backbone: Backbone, solved: Solver) -> Soluti
 def _judged(graph: ViewGraph, found: Diagnosis, solved: Solver) -> Solution:
     """The poses of the edges that a diagnosis without a backbone keeps."""
     known = replace(graph, information=found.information) if has_unit_information(graph) else graph
-    kept = found.kept & graph.information.any(axis=(1, 2))
+    stated = edge_weights(graph, dimension_of(graph))
+    kept = found.kept & stated.used
 
     def weighed(weights: Floats, poses: Floats) -> Solution:
         rows = np.flatnonzero(weights)
@@ -107,7 +108,6 @@ def _judged(graph: ViewGraph, found: Diagnosis, solved: Solver) -> Solution:
         weights, final = reweighted(known, weights, final, weighed)
     whole = np.zeros(graph.edge_count)
     whole[np.flatnonzero(weights)] = final.weights * weights[np.flatnonzero(weights)]
-    stated = edge_weights(graph, dimension_of(graph))
     told = (note for note in stated.notes if note not in final.notes)
     notes = (*told, _told(found, whole), *found.notes, *final.notes)
     return _with_confirmation(graph, stated.used, replace(final, weights=whole, notes=notes))
@@ -120,9 +120,11 @@ def is_explained(graph: ViewGraph, solution: Solution) -> bool:
     if has_unit_information(graph):
         return False
     axes = 3 if dimension_of(graph) == 2 else 6
-    tree = graph.vertex_count - int(solution.component.max(initial=-1)) - 1
-    freedom = axes * (graph.edge_count - tree)
-    return not freedom or solution.metrics["objective"] <= freedom + SIGMAS * math.sqrt(2 * freedom)
+    component, priors = solution.component, 0 if graph.priors is None else len(graph.priors.vertices)
+    # of each component one pose is free to choose, unless more are held; all that have priors share the world's
+    held = np.maximum(np.bincount(component[graph.fixed], minlength=int(component.max(initial=-1)) + 1), 1).sum()
+    freedom = axes * int(graph.edge_count + priors - graph.vertex_count + held - (priors > 0))
+    return freedom <= 0 or solution.metrics["objective"] <= freedom + SIGMAS * math.sqrt(2 * freedom)
 
 
 def _placed(graph: ViewGraph, poses: Floats, start: Floats | None) -> Floats:

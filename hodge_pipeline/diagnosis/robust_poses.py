@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.judging import FREEDOM, STUDENT_99, left_over, squares_at_both_ends
+from hodge_pipeline.complex.judging import FREEDOM, STUDENT_99, left_over, squares_at_both_ends, tail_weight
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import Alignment
 from hodge_pipeline.solvers.minimise import descend_isotropic
@@ -24,7 +24,7 @@ ANNEALED = (1e4, 1e3, 300.0)
 """Gates for poses that drifted while they grew: edges that they miss by far pull them into place (graduated
 non-convexity, Yang et al. 2020), and what does not follow falls out.
 """
-DIMENSION = 6.0
+DIMENSION = 6
 """Of a pose."""
 ROUNDS = 4
 """Of weights in a solve."""
@@ -63,7 +63,7 @@ def fit(evidence: Evidence, alignment: Alignment, gates: tuple[float, ...], init
         if following < gate and np.array_equal(used, found.chi2 < following):
             continue
         rough, widened = gate > GATE, max(gate / GATE, 1.0)
-        first = found.chi2 / widened if rough else np.full(len(used), DIMENSION)
+        first = found.chi2 / widened if rough else np.full(len(used), float(DIMENSION))
         limits = QUICKLY if rough or len(used) > LARGE else FULLY
         poses, squares = _solve(evidence, found.poses, used, first, limits, widened, initial)
         piece = connected_components(evidence.graph.edges[used], evidence.graph.vertex_count)
@@ -96,7 +96,7 @@ def _solve(
     rotations, translations = setup.initial(initial)
     exact = np.zeros(len(poses), np.int64), np.zeros(len(used))
     for _ in range(ROUNDS):
-        share = ((FREEDOM + DIMENSION) / (FREEDOM + squares[used]))[setup.weights.used]
+        share = tail_weight(squares[used], DIMENSION)[setup.weights.used]
         problem = replace(setup.problem, kappa=share * setup.problem.kappa, tau=share * setup.problem.tau)
         point = descend_isotropic(problem, (rotations, translations), limits, setup.rounding).point
         rotations, translations, poses = point.rotations, point.translations, setup.poses(point)

@@ -63,16 +63,6 @@ class Testimony:
         none = np.zeros(len(away))
         return cls(linear.chain, linear, none, away, none > 0)
 
-    def testimonies(self) -> float:
-        """How many there are, of which the best is taken: a place makes one."""
-        return float((1 / loops_at_place(self.chain.places)).sum())
-
-    def displaced(self, loop: Ints) -> Floats:
-        """The motion (K, 4, 4) of the world beyond a break that each of these loops asks for."""
-        low, high = self.chain.ends[loop].T
-        poses = self.linear.poses
-        return np.asarray(poses[low] @ self.chain.motion[loop] @ se3.inverse(poses[high]))
-
     def factor(self, first: Ints, second: Ints) -> Floats:
         """Log Bayes factor (K,) of the loops `second` if the loops `first` are right: by the paths between their lower
         ends and between their upper ends, whatever lies between lower and upper.
@@ -92,11 +82,10 @@ class Testimony:
         """
         chain, poses, total = self.chain, self.linear.poses, self.linear.covariance
         a, b = chain.ends[loop].T
-        end = self.displaced(loop) @ poses[high]
+        end = poses[a] @ chain.motion[loop] @ se3.inverse(poses[b]) @ poses[high]
 
         def local(frame: Floats, covariance: Floats) -> Floats:
-            turned = frame.copy()
-            turned[:, :3, 3] = 0.0
+            turned = se3.from_parts(frame[:, :3, :3], np.zeros(3))
             return chain.carried(se3.inverse(turned), shifted(covariance, chain.lever(frame[:, :3, 3])))
 
         before = local(end, total[np.maximum(a, low)] - total[np.minimum(a, low)])
@@ -295,8 +284,7 @@ class Runs:
         chi2, size = student(residual, total)[1], residual.shape[1]
         tense = max(1.0, float(np.median(chi2)) / size)  # as if the steps' scale were too small by the usual run
         log_density, chi2 = student(residual, tense * total)
-        poses, turned = chain.poses, linear.poses[high].copy()
-        turned[:, :3, 3] = 0.0
+        poses, turned = chain.poses, se3.from_parts(linear.poses[high, :3, :3], np.zeros(3))
         ahead = chain.exp((chain.adjoint(se3.inverse(turned)) @ residual[..., None])[..., 0])
         others = replace(
             chain,

@@ -114,7 +114,8 @@ def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
     linear, factor = found.start, found.judged.factor
     shares = np.log(mixture(factor)[0])
     told = Testimony(linear.chain, linear, np.logaddexp(shares[0] + factor, shares[1]), found.judged.wrong, found.used)
-    usual, least, fold = Usual.of(chain), by_chance(len(factor)), np.log(max(told.testimonies(), 1))
+    usual, least = Usual.of(chain), by_chance(len(factor))
+    fold = np.log(max((1 / loops_at_place(told.chain.places)).sum(), 1))  # of testimonies, one a place, for the best
     agreed = [each for each in agreed_breaks(told, usual) if each.log_evidence > BY_CHANCE + fold]
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
     worth = [(each, least) for each in agreed[:MOST_TRIED] if each is agreed[0] or each.at != agreed[0].at]

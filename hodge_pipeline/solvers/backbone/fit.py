@@ -87,8 +87,7 @@ def linearise(chain: Chain, poses: Floats) -> Linear:
 def loops_at(chain: Chain, poses: Floats, rows: Ints) -> tuple[Floats, Floats]:
     """Residuals (K, p) and covariances (K, p, p) of loops, in the world's directions at their later ends."""
     a, b = chain.ends[rows].T
-    turned = poses[b].copy()
-    turned[:, :3, 3] = 0.0
+    turned = se3.from_parts(poses[b, :3, :3], np.zeros(3))
     left = chain.log(se3.inverse(chain.motion[rows]) @ se3.inverse(poses[a]) @ poses[b])
     return np.einsum("nij,nj->ni", chain.adjoint(turned), left), chain.carried(turned, chain.covariance[rows])
 
@@ -131,13 +130,12 @@ def inverse(covariance: Floats) -> Floats:
 class Reduced:
     """The ends of the active loops and the runs of steps between them.
 
-    - `ends (R,)`: positions, ascending; `runs (S, 2)`, `loops (L, 2)`: rows of it; `active (L,)`: rows of the loops.
+    - `ends (R,)`: positions, ascending; `runs (S, 2)`: rows of it; `active (L,)`: rows of the loops.
     - `network`: of the runs and then the loops.
     """
 
     ends: Ints
     runs: Ints
-    loops: Ints
     active: Ints
     network: Network
 
@@ -148,7 +146,7 @@ class Reduced:
         after = np.flatnonzero(chain.path[ends[1:]] == chain.path[ends[:-1]])
         runs = np.stack([after, after + 1], axis=1)
         loops = np.searchsorted(ends, chain.ends[active])
-        return cls(ends, runs, loops, active, Network.of(np.concatenate([runs, loops]), len(ends)))
+        return cls(ends, runs, active, Network.of(np.concatenate([runs, loops]), len(ends)))
 
     @property
     def of_runs(self) -> slice:

@@ -109,7 +109,7 @@ class _Trial:
         used |= always
         reduced = thinned(chain, np.flatnonzero(used))
         # wrong loops may have led into a valley that the right ones do not leave
-        fit = min((settled(Fit(reduced, begun), MOST_STEPS) for begun in (linear, start)), key=_cost)
+        fit = min((settled(Fit(reduced, begun), MOST_STEPS) for begun in (linear, start)), key=lambda each: each.cost)
         judged = judge(fit.linear, fit, shares, self.wrong)
         shares, top = mixture(judged.factor)
         used &= (judged.log_odds > 0) | always
@@ -187,7 +187,7 @@ class _Trial:
             if not number and fit.cost > len(reduced.active) * len(chain.axes):
                 # more than right loops should leave: the descent may have ended in a valley beside
                 other = settled(Fit(reduced, from_rotations(Fit(reduced, start), MOST_STEPS)), MOST_STEPS)
-                fit = min(fit, other, key=_cost)
+                fit = min(fit, other, key=lambda each: each.cost)
             linear = fit.linear
             judged = judge(linear, fit, shares, self.wrong)
             shares, likelihood = mixture(judged.factor)
@@ -213,10 +213,6 @@ REARRANGED = 3
 """Times that the loops are judged, at first and after places were left out or added: a limit on cost."""
 MOST_GROWN = 30
 """Rounds in which loops are added: a limit on cost."""
-
-
-def _cost(fit: Fit) -> float:
-    return fit.cost
 
 
 def refused(found: Inferred, always: Bools) -> Inferred:

@@ -16,7 +16,7 @@ from hodge_pipeline.types import Floats, Ints
 
 FOLD = np.log(4.0)
 """Standard deviation of a scale's logarithm beforehand: stated information is seldom wrong by more."""
-FIRST, FINEST = np.log(4.0), np.log(2.0) / 3
+FIRST, FINEST = np.log(4.0), np.log(2.0) / 2
 """Steps of the search, in the logarithm of a scale."""
 MOST_RATIO = np.log(2.0)
 """Between the scales of rotation and of translation, where information is stated."""

@@ -126,7 +126,7 @@ class Factored:
         return np.asarray(own - off - np.swapaxes(off, 1, 2))
 
     def _inverse(self) -> tuple[Floats, Floats]:
-        plan, p = self.network.plan, self.blocks.pivots.shape[-1] if len(self.blocks.pivots) else self._width()
+        plan, p = self.network.plan, self.carry.shape[-1]
         diagonal, rows = np.zeros((plan.size + 1, p, p)), np.zeros((len(plan.slot_rows) + 1, p, p))
         begin = plan.core
         if begin < plan.size:
@@ -138,10 +138,6 @@ class Factored:
         for group in reversed(plan.groups):
             self._of_group(group, diagonal, rows)
         return diagonal, rows
-
-    def _width(self) -> int:
-        left = self.network.plan.size - self.network.plan.core
-        return self.core.shape[0] // left if left else 1
 
     def _of_group(self, group: Group, diagonal: Floats, rows: Floats) -> None:
         plan, (count, k) = self.network.plan, group.neighbours.shape
