@@ -165,3 +165,17 @@ def test_errors_of_cycles_are_those_of_the_edges_that_they_list() -> None:
 def test_an_odometry_that_errs_more_than_it_states_is_said(misstated: float, said: bool) -> None:
     found = diagnose(drive(seed=0, wrong=0.3, misstated=(misstated, 1.0)).graph)
     assert any("times what they state, or the loops are wrong alike" in note for note in found.notes) == said
+
+
+@pytest.mark.parametrize("weak", [1e-2, 1e6])
+def test_a_robot_in_the_plane_is_one_whatever_is_stated_out_of_it(weak: float) -> None:
+    """One scale was learned for three rotations, of which two are exact: odometry counted a hundred times as much."""
+    made = drive(dimension=2, wrong=0.3)
+    information = made.graph.information.copy()
+    information[:, [0, 1, 5], [0, 1, 5]] = weak
+    found, planar = (
+        find_backbone(each) for each in (replace(made.graph, information=information, dimension=3), made.graph)
+    )
+    assert found is not None and planar is not None
+    np.testing.assert_array_equal(found.used, planar.used)
+    np.testing.assert_allclose(found.world_from_cam, planar.world_from_cam, atol=1e-9)

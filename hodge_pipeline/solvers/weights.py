@@ -43,13 +43,17 @@ def dimension_of(graph: ViewGraph) -> Literal[2, 3]:
     """How many dimensions the frames move in: two also where every edge of a graph in space lies in the plane z = 0 and
     has no information out of it, as of one that was lifted.
     """
-    if graph.dimension == 2:
-        return 2
-    if not graph.edge_count:
-        return 3
+    lifted = moves_in_plane(graph) and not graph.information[:, OUT_OF_PLANE].any()
+    return 2 if graph.dimension == 2 or lifted else 3
+
+
+def moves_in_plane(graph: ViewGraph) -> bool:
+    """Whether every edge of a graph lies in the plane z = 0, and errors out of it tell nothing of those in it."""
+    if graph.dimension == 2 or not graph.edge_count:
+        return graph.dimension == 2
     motion = graph.i_from_j
     off = np.abs(np.concatenate([motion[:, 2, :2], motion[:, :2, 2], motion[:, 2:3, 3]], axis=1)).max()
-    return 2 if off < PLANAR_TOLERANCE and not graph.information[:, OUT_OF_PLANE].any() else 3
+    return bool(off < PLANAR_TOLERANCE and not graph.information[:, OUT_OF_PLANE[:, None], PLANAR_AXES].any())
 
 
 def edge_weights(graph: ViewGraph, dimension: int) -> Weights:

@@ -26,7 +26,7 @@ from hodge_pipeline.solvers.backbone.polish import LOCAL
 from hodge_pipeline.solvers.backbone.step_tests import LOOPS_AT_A_STEP, agreeing_loops, is_tested
 from hodge_pipeline.solvers.backbone.window import windowed
 from hodge_pipeline.solvers.maximum_likelihood import solve
-from hodge_pipeline.solvers.weights import dimension_of
+from hodge_pipeline.solvers.weights import moves_in_plane
 from hodge_pipeline.types import Bools, Floats, ViewGraph
 from hodge_pipeline.types.text import counted
 
@@ -130,7 +130,7 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
     """
     if trust == NONE or not graph.edge_count:
         return None
-    graph = replace(graph, dimension=dimension_of(graph))
+    graph = replace(graph, dimension=2 if moves_in_plane(graph) else 3)
     again = consecutive_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
     if trust not in (AUTO, SEQUENTIAL):  # repeats of its other edges are loops, as these are
         pair = np.sort(graph.edges, axis=1) @ [graph.vertex_count, 1]
