@@ -8,6 +8,7 @@ import pytest
 from benchmarks.edge_scores import precision_and_recall
 from diagnosis_graphs import every_pair_tried, measured, near_pairs, poses_on_a_ring, spoiled
 from hodge_pipeline import se3
+from hodge_pipeline.diagnosis import evidence
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.evidence import order_prior, prior_by_cycles
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
@@ -88,6 +89,13 @@ def test_edges_that_repeat_or_join_a_vertex_to_itself_tell_nothing_of_the_order(
     for more in (own, np.repeat(near, 4, axis=0)):
         prior = order_prior(np.concatenate([edges, more]), count)[: len(edges)]
         np.testing.assert_array_equal(prior, order_prior(edges, count))
+
+
+def test_a_far_pair_that_repeats_is_tried_once() -> None:
+    """Twelve loops stated thirty times made a walk one of which every pair was tried."""
+    steps = np.arange(40)[:, None] + [0, 1]
+    far = np.stack([np.arange(12), np.arange(12) + 28], axis=1)
+    assert not evidence.every_pair_tried(np.concatenate([steps, np.repeat(far, 30, axis=0)]), 41)
 
 
 def test_unknown_information_is_unknown_of_half_angles_too() -> None:

@@ -40,6 +40,14 @@ def test_what_is_not_plain_data_is_refused(text: str, expected: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_what_is_done_to_a_document_is_not_done_to_the_next_of_the_same_text() -> None:
+    changed = yaml_file.parse("a: {b: [1]}", "file.yaml")
+    changed.data["a"]["b"].append(2)
+    changed.origins.clear()
+    again = yaml_file.parse("a: {b: [1]}", "file.yaml")
+    assert again.data == {"a": {"b": [1]}} and again.where(("a", "b")) == "file.yaml:1"
+
+
 def test_aliases_cannot_multiply_without_bound() -> None:
     levels = "".join(f"{chr(98 + k)}: &{chr(98 + k)} [{', '.join([f'*{chr(97 + k)}'] * 9)}]\n" for k in range(9))
     with pytest.raises(RecipeError, match="this is no recipe"):

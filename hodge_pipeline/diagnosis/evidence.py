@@ -45,19 +45,19 @@ def order_prior(edges: Ints, vertex_count: int) -> Floats:
     edges and (1 - q) f wrong ones, so q = (r - f) / (1 - f), and an edge between them is right with probability q / r.
     All are equal where neighbours are hardly more often joined than far pairs. Vertex rows are the order.
     """
-    bounds = _gap_classes(edges, vertex_count)[1]
-    place = _gap_classes(orient_edges(edges, vertex_count).edges, vertex_count)[0]
-    joined = np.bincount(place, minlength=len(bounds) - 1)[: len(bounds) - 1]
+    place, bounds = _gap_classes(edges, vertex_count)
+    simple = orient_edges(edges, vertex_count).edges
+    joined = np.bincount(_gap_classes(simple, vertex_count)[0], minlength=len(bounds) - 1)[: len(bounds) - 1]
     pairs = np.array([_pairs(low, high, vertex_count) for low, high in zip(bounds[:-1], bounds[1:], strict=True)])
     rate = np.minimum(joined / np.maximum(pairs, 1), 1.0)
-    far = _far_rate(edges, vertex_count)
+    far = _far_rate(simple, vertex_count)
     # by odds, which work where most pairs are joined too, with a few more missing neighbours: it may be chance
     missed = 1 - rate[0] + DOUBTED / max(pairs[0], 1)
     if rate[0] * (1 - far) < LEAST_ODDS * far * missed or not joined.any():
         return np.full(len(edges), 0.5)
     right = np.maximum(rate - far, 0) / (1 - far)
     share = np.clip(right / np.maximum(rate, 1e-12), FLOOR, CEILING)
-    return np.asarray(share[_gap_classes(edges, vertex_count)[0]])
+    return np.asarray(share[place])
 
 
 def prior_by_cycles(edges: Ints, vertex_count: int, cycles: Cycles) -> Floats:
@@ -109,14 +109,16 @@ def right_by_gap(edges: Ints, vertex_count: int, cycles: Cycles, usual: float) -
 
 def every_pair_tried(edges: Ints, vertex_count: int) -> bool:
     """Whether far pairs are joined so often that registration seems to have been tried on all pairs."""
-    if len(edges) < LEAST_DEGREE / 2 * vertex_count:
+    simple = orient_edges(edges, vertex_count).edges
+    if len(simple) < LEAST_DEGREE / 2 * vertex_count:
         return False  # of few views the ends of any loop are a large share of the far pairs
-    return _far_rate(edges, vertex_count) >= TRIED_FROM
+    return _far_rate(simple, vertex_count) >= TRIED_FROM
 
 
-def _far_rate(edges: Ints, vertex_count: int) -> float:
+def _far_rate(simple: Ints, vertex_count: int) -> float:
+    """The share of far pairs that these (N, 2), each once and the lower first, are."""
     start = max(int(np.ceil(FAR_SHARE * vertex_count)), 2)
-    far = np.ptp(orient_edges(edges, vertex_count).edges, axis=1) >= start
+    far = simple[:, 1] - simple[:, 0] >= start
     return float(far.sum() / max(_pairs(start, vertex_count, vertex_count), 1))
 
 

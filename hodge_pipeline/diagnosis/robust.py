@@ -120,10 +120,11 @@ def is_explained(graph: ViewGraph, solution: Solution) -> bool:
     if has_unit_information(graph):
         return False
     axes = 3 if dimension_of(graph) == 2 else 6
-    component, priors = solution.component, 0 if graph.priors is None else len(graph.priors.vertices)
-    # of each component one pose is free to choose, unless more are held; all that have priors share the world's
-    held = np.maximum(np.bincount(component[graph.fixed], minlength=int(component.max(initial=-1)) + 1), 1).sum()
-    freedom = axes * int(graph.edge_count + priors - graph.vertex_count + held - (priors > 0))
+    known = np.zeros(0, np.int64) if graph.priors is None else graph.priors.vertices
+    free = np.ones(int(solution.component.max(initial=-1)) + 1, np.int64)  # poses to choose, one of each component
+    free[solution.component[known]] = 0
+    held = np.maximum(np.bincount(solution.component[graph.fixed], minlength=len(free)), free).sum()
+    freedom = axes * int(graph.edge_count + len(known) - graph.vertex_count + held)
     return freedom <= 0 or solution.metrics["objective"] <= freedom + SIGMAS * math.sqrt(2 * freedom)
 
 

@@ -19,7 +19,10 @@ TOO_LONG = "every loop through it is too long to be listed: nothing tests it"
 
 def name_cycle(graph: ViewGraph, cycles: Cycles, row: int) -> str:
     """The vertices along a cycle, `3-7-12`, the middle of a long one left out."""
-    names = list(map(str, graph.vertex_ids[cycles.loops.select(np.array([row])).vertices(graph.edges)].tolist()))
+    loops = cycles.loops
+    entry = slice(loops.offsets[row], loops.offsets[row + 1])
+    tails = graph.edges[loops.edge[entry], np.where(loops.sign[entry] > 0, 0, 1)]
+    names = list(map(str, graph.vertex_ids[tails].tolist()))
     if len(names) > LONGEST_NAMED:
         names = [*names[:6], f"({len(names) - 9} more)", *names[-3:]]
     return "-".join(names)
@@ -92,7 +95,8 @@ def _against(is_bridge: bool, away: str) -> str:
 
 
 def _undecided(graph: ViewGraph, cycles: Cycles, row: int, doubted: Bools) -> str:
-    edges = cycles.loops.select(np.array([row])).edge
+    entry = slice(cycles.loops.offsets[row], cycles.loops.offsets[row + 1])
+    edges = cycles.loops.edge[entry]
     mates = np.sort(edges[doubted[edges]])
     if len(mates) == len(edges):
         which = f"one of its {len(edges)} edges"

@@ -189,7 +189,7 @@ def _some(rows: Ints) -> Ints:
 class _Model:
     """Residuals (M, p) of cycles of one loop or two, with the covariances of their paths and of their loops as parts
     (3, M, p, p): of rotation, of translation, and of both together; `fixed (M, p, p)`: what no scale changes; `away`:
-    the same if the loops are wrong.
+    where the loops lead if they are wrong.
     """
 
     away: WrongLoops

@@ -255,6 +255,6 @@ def of_every_loop(graph: ViewGraph, backbone: Backbone, trusted: Bools) -> Backb
 MOST_SOLVED, TOLERANCE = 5, 1e-4
 """Times that poses are solved for, each in seconds for 100,000 edges; and how precisely, of χ²."""
 SURPRISING = 2.5
-"""Times what steps state: larger errors are said. Right loops of 288 simulated walks that err so ask for up to 2."""
+"""Times what steps state: larger errors are said. Right loops of 288 walks that err as stated ask for up to 2."""
 UNUSED = 0.49
 """The most probable that a loop which does not count is: too little speaks for it."""
