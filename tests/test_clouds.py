@@ -273,8 +273,8 @@ def test_clouds_on_disk_give_their_memory_back(tmp_path: Path) -> None:
     clouds = CloudSet.open(tmp_path)
 
     def resident_kb() -> int:
-        """Of the file of the points, in this process."""
-        parts = Path("/proc/self/smaps").read_text().split("points.npy\n")[1:]
+        """Of this file of points, in this process."""
+        parts = Path("/proc/self/smaps").read_text().split(f"{clouds.points.filename}\n")[1:]
         return sum(int(part.split("Rss:")[1].split()[0]) for part in parts)
 
     if not Path("/proc/self/smaps").is_file():
