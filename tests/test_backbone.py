@@ -15,7 +15,7 @@ from hodge_pipeline.solvers.backbone import fit
 from hodge_pipeline.solvers.backbone.anyway import backbone_anyway
 from hodge_pipeline.solvers.backbone.chain import linear_forest, make_chain, sequential_edges
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, linearise, root, settled
-from hodge_pipeline.solvers.backbone.sparse import Network
+from hodge_pipeline.solvers.backbone.sparse import NormalEquations
 from hodge_pipeline.solvers.backbone.trust import find_backbone, of_every_loop
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import ViewGraph
@@ -42,7 +42,7 @@ def test_selected_inversion_is_the_dense_inverse() -> None:
         whole[i, :, i] += moved.T @ weight @ moved
         whole[i, :, j] -= moved.T @ weight
         whole[j, :, i] -= weight @ moved
-    network = Network.of(edges, count)
+    network = NormalEquations.of(edges, count)
     free = np.flatnonzero(network.place < network.plan.size)
     inverse = np.zeros_like(whole)
     rows = np.ix_(free, range(3), free, range(3))

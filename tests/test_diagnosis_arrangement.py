@@ -12,7 +12,7 @@ from hodge_pipeline.diagnosis.consensus import best_arrangement
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.placement import arrangement_log_evidence
-from hodge_pipeline.diagnosis.robust_poses import Fit
+from hodge_pipeline.diagnosis.robust_poses import Solved
 from hodge_pipeline.diagnosis.scene_model import learn_scene_model
 from hodge_pipeline.diagnosis.search import searched
 
@@ -21,11 +21,11 @@ ASIDE = se3.exp(np.array([[0.0, 0.0, 1.0, 4.0, 1.0, 0.0]]))[0]
 
 
 @pytest.fixture(scope="module")
-def solved() -> tuple[Evidence, Fit]:
+def solved() -> tuple[Evidence, Solved]:
     """A room in one piece, with the evidence for it."""
-    kept: list[tuple[Evidence, Fit]] = []
+    kept: list[tuple[Evidence, Solved]] = []
 
-    def watched(evidence: Evidence, start: Fit) -> Fit:
+    def watched(evidence: Evidence, start: Solved) -> Solved:
         found = best_arrangement(evidence, start)
         kept.append((evidence, found))
         return found
@@ -37,7 +37,7 @@ def solved() -> tuple[Evidence, Fit]:
     return kept[0]
 
 
-def test_a_scene_is_worth_less_with_a_part_of_it_elsewhere_or_apart(solved: tuple[Evidence, Fit]) -> None:
+def test_a_scene_is_worth_less_with_a_part_of_it_elsewhere_or_apart(solved: tuple[Evidence, Solved]) -> None:
     evidence, found = solved
     model = learn_scene_model(evidence, found)
     value = arrangement_log_evidence(evidence, found, model)
@@ -51,7 +51,7 @@ def test_a_scene_is_worth_less_with_a_part_of_it_elsewhere_or_apart(solved: tupl
 
 
 @pytest.mark.parametrize("in_one_piece", [False, True])
-def test_a_part_that_lies_elsewhere_is_laid_back(solved: tuple[Evidence, Fit], in_one_piece: bool) -> None:
+def test_a_part_that_lies_elsewhere_is_laid_back(solved: tuple[Evidence, Solved], in_one_piece: bool) -> None:
     evidence, found = solved
     moved = np.where(PART[:, None, None], ASIDE @ found.poses, found.poses)
     i, j = evidence.graph.edges.T

@@ -9,20 +9,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import fdtri
+from scipy.special import chdtri, fdtri
 
 from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, Floats, ViewGraph
 
 FREEDOM = 4.0
 """Degrees of freedom of Student's t, the tails of real registration errors: of nine graphs of fragments of rooms."""
-STUDENT_99 = {3: 50.08, 6: 91.24}
-"""The 99 % quantiles of its χ² with 3 and 6 axes, that of Fisher's F times the axes: beyond, an edge is no error."""
 REGISTERED_FREEDOM = 30.0
 """As `FREEDOM`, of edges that a run registered, accepted and kept: red kitchen, fr1/xyz, fr1/rpy, rendered rooms. 10 to
 100 do as well; a gate makes fr1 worse, and 4 makes red kitchen's rotations from frame to frame worse.
 """
-MEDIAN_CHI2 = {1: 0.455, 3: 2.366, 6: 5.348}
+MEDIAN_CHI2 = {axes: float(chdtri(axes, 0.5)) for axes in (1, 3, 6)}
 EXACT = 1e-9
 """Of the largest χ²: edges in no cycle fit exactly, and tell nothing about the usual χ²."""
 UNMEASURED = 1e-9
@@ -49,6 +47,10 @@ def tail_weight(chi2: Floats | float, axes: int) -> Floats:
 def tail_gate(axes: int, share: float) -> float:
     """The χ² beyond which so small a share of right edges lies: by Fisher's F, as Student's t has it."""
     return axes * float(fdtri(axes, FREEDOM, 1 - share))
+
+
+STUDENT_99 = {axes: tail_gate(axes, 0.01) for axes in (3, 6)}
+"""Of so many axes, the χ² beyond which an edge is no error: the 99 % quantile of Student's t."""
 
 
 def student_weight(chi2: Floats, axes: int, *, usual: Floats, registered: bool = False) -> Floats:

@@ -10,12 +10,13 @@ fall out.
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import expit
 
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import Alignment, align
 from hodge_pipeline.diagnosis.placement import arrangement_log_evidence
-from hodge_pipeline.diagnosis.robust_poses import ANNEALED, GATE, LARGE, ONCE, TWICE, Fit, fit
+from hodge_pipeline.diagnosis.robust_poses import ANNEALED, GATE, LARGE, ONCE, TWICE, Solved, fit
 from hodge_pipeline.diagnosis.scene_model import learn_scene_model
 from hodge_pipeline.diagnosis.search import LARGEST, searched
 from hodge_pipeline.types import Floats
@@ -29,7 +30,7 @@ EVERY = 1e9
 """A gate that lets every edge pass."""
 
 
-def find_consensus(evidence: Evidence) -> Fit:
+def find_consensus(evidence: Evidence) -> Solved:
     """The solution that most edges agree with."""
     grown = align(evidence)
     if evidence.exhaustive:
@@ -37,7 +38,7 @@ def find_consensus(evidence: Evidence) -> Fit:
     return _mended(evidence, grown)
 
 
-def sought_from(evidence: Evidence, best: Fit, start: Floats) -> Fit:
+def sought_from(evidence: Evidence, best: Solved, start: Floats) -> Solved:
     """The best solution so far, or that which poses `start (V, 4, 4)` lead to where more edges agree with it: groups of
     wrong loops may leave less of χ² where they have torn a graph.
     """
@@ -46,15 +47,15 @@ def sought_from(evidence: Evidence, best: Fit, start: Floats) -> Fit:
     return max(best, other, key=lambda found: int(found.used.sum()))
 
 
-def agreeing(evidence: Evidence, found: Fit) -> Floats:
+def agreeing(evidence: Evidence, found: Solved) -> Floats:
     """The probability (E,) that each edge is right, given the solution."""
     clipped = np.clip(np.sqrt(np.maximum(0.0, 1 - found.chi2 / GATE)), EXTREME, 1 - EXTREME)
     prior = evidence.prior
     logit = np.log(clipped / (1 - clipped)) + PRIOR_SHARE * np.log(prior / (1 - prior))
-    return np.asarray(1 / (1 + np.exp(-logit)))
+    return np.asarray(expit(logit))
 
 
-def best_arrangement(evidence: Evidence, start: Fit) -> Fit:
+def best_arrangement(evidence: Evidence, start: Solved) -> Solved:
     """The arrangement with the largest log-evidence, from `start` and from the order; `start` itself where there are
     too many views.
     """
@@ -68,7 +69,7 @@ def best_arrangement(evidence: Evidence, start: Fit) -> Fit:
     return found[int(np.argmax(values))]
 
 
-def _mended(evidence: Evidence, grown: Alignment) -> Fit:
+def _mended(evidence: Evidence, grown: Alignment) -> Solved:
     """The solution that grown pieces lead to where the order tells nothing of pairs that were tried."""
     graph, best = evidence.graph, fit(evidence, grown, ANNEALED)
     # a ring of many edges hides a whole turn, which no descent undoes and chordal rotations have not
@@ -90,6 +91,6 @@ def _in_order(evidence: Evidence) -> Alignment:
     return align(evidence, align(evidence.select(np.flatnonzero(steps))))
 
 
-def _misfit(found: Fit) -> float:
+def _misfit(found: Solved) -> float:
     """χ² of all edges, of each no more than the gate."""
     return float(np.minimum(found.chi2, GATE).sum())

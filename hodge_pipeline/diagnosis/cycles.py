@@ -12,9 +12,10 @@ from hodge_pipeline.complex.judging import MEDIAN_CHI2
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.types import Bools, Floats, Ints
 
-GATE = 30.0
+CLOSES_BELOW = 30.0
 """χ² over six dimensions of a cycle that closes, and of two edges that agree. Generous, since tails are heavy."""
 WITNESSES = 3
+"""Cycles that are named for an edge."""
 SIGMAS = 4.0
 """By which more cycles must close well than do by chance: 118 and more do in eight graphs of the literature, 12 and 24
 in two lattices with wrong edges; where all loops are random up to 3.5, but 64 in one of the eight with parallel edges.
@@ -39,7 +40,7 @@ def judge_cycles(loops: Loops, angle: Floats, displacement_m: Floats, noise: Noi
     turn, shift = loops.sums(noise.rotation_rad**2), loops.sums(noise.translation_m**2)
     swing = turn * (reach_m * loops.lengths) ** 2 / 12
     chi2 = angle**2 / np.maximum(turn, 1e-300) + displacement_m**2 / np.maximum(shift + swing, 1e-300)
-    return Cycles(loops, angle, displacement_m, chi2, chi2 < GATE)
+    return Cycles(loops, angle, displacement_m, chi2, chi2 < CLOSES_BELOW)
 
 
 def close_by_chance(cycles: Cycles, i_from_j: Floats, noise: Noise, reach_m: float) -> bool:
@@ -65,7 +66,7 @@ def usual_share(cycles: Cycles) -> float:
 
 def closing_support(cycles: Cycles, prior: Floats) -> Floats:
     """How many cycles (E,) close over each edge, each weighed by how likely its other edges are."""
-    strength = np.maximum(0.0, 1 - cycles.chi2 / GATE)
+    strength = np.maximum(0.0, 1 - cycles.chi2 / CLOSES_BELOW)
     return cycles.loops.sums_at_edges(strength * np.exp(cycles.loops.sums(np.log(prior))), len(prior)) / prior
 
 

@@ -26,7 +26,7 @@ from hodge_pipeline.diagnosis.result import (
     WRONG,
     Diagnosis,
 )
-from hodge_pipeline.diagnosis.robust_poses import Fit
+from hodge_pipeline.diagnosis.robust_poses import Solved
 from hodge_pipeline.diagnosis.shared_blame import share_blame
 from hodge_pipeline.diagnosis.wording import reasons
 from hodge_pipeline.one_blas_thread import one_blas_thread
@@ -106,7 +106,7 @@ class _ByCycles:
         return close_by_chance(self.cycles, known.graph.i_from_j, known.noise, known.reach_m)
 
     @cached_property
-    def fit(self) -> Fit:
+    def fit(self) -> Solved:
         """The solution that most edges agree with."""
         return find_consensus(self.evidence)
 
@@ -120,7 +120,7 @@ class _ByCycles:
         in_order = world_from_cam[np.argsort(self.rank)] @ self.there
         return self._diagnosis(sought_from(self.evidence, self.fit, in_order))
 
-    def _diagnosis(self, fit: Fit) -> Diagnosis:
+    def _diagnosis(self, fit: Solved) -> Diagnosis:
         stated, evidence, there = self.stated, self.evidence, self.there
         agrees = agreeing(evidence, fit)
         cycles = _with_witnesses(self.cycles, fit.used, evidence)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import expit
 
 from hodge_pipeline.complex.cech import orient_edges
 from hodge_pipeline.complex.closing import cycle_errors
@@ -15,12 +16,15 @@ from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 FLOOR, CEILING = 0.05, 0.98
+"""Of a prior probability: what the order of the views says can be overruled."""
 FAR_SHARE = 0.25
 """Pairs further apart than this share of the vertices give the rate at which any two views are joined."""
 LEAST_ODDS = 2.0
 """Of neighbours in order to be joined, in units of those of far pairs, for the order to count."""
 DOUBTED = 2
+"""Neighbours that are counted as missing besides: of few views all may be joined by chance."""
 ROUNDS = 30
+"""Of fixed-point iterations: a limit on cost."""
 FEW = 20
 """Edges of a gap at which the usual share of right edges weighs as much as their own."""
 TRIED_FROM = 0.1
@@ -104,7 +108,7 @@ def right_by_gap(edges: Ints, vertex_count: int, cycles: Cycles, usual: float) -
     trust = number / (number + FEW)
     usual = float(np.clip(usual, FLOOR, CEILING))
     logit = trust * np.log(share / (1 - share)) + (1 - trust) * np.log(usual / (1 - usual))
-    return np.asarray(1 / (1 + np.exp(-logit[place])))
+    return np.asarray(expit(logit[place]))
 
 
 def every_pair_tried(edges: Ints, vertex_count: int) -> bool:

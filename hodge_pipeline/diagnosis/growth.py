@@ -14,13 +14,14 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from hodge_pipeline import se3
-from hodge_pipeline.diagnosis.cycles import GATE
+from hodge_pipeline.diagnosis.cycles import CLOSES_BELOW
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.types import Bools, Floats, Ints
 
 HYPOTHESES = 24
 """Votes of a pair of pieces, the weightiest, that are tried as the answer."""
-MOST_PAIRS_TO_A_VOTE = 400
+MOST_COMPARED = 400
+"""Of a pair of pieces, that each is compared with: a limit on cost."""
 PER_FOLD = 2.0
 """Nats that agreeing edges between two sets of views add per e-fold of their number: they are one event, since places
 that look alike give many wrong edges that agree."""
@@ -140,7 +141,7 @@ def _compared(pair: Ints, start: Ints, count: Ints) -> tuple[Ints, Ints]:
     rank = np.arange(len(pair)) - start[pair]
     hypothesis = np.flatnonzero(rank < HYPOTHESES)
     total = count[pair[hypothesis]]
-    taken = np.minimum(total, MOST_PAIRS_TO_A_VOTE)
+    taken = np.minimum(total, MOST_COMPARED)
     row = np.repeat(np.arange(len(hypothesis)), taken)
     number = np.arange(len(row)) - np.repeat(np.cumsum(taken) - taken, taken)
     return hypothesis[row], start[pair[hypothesis]][row] + number * total[row] // taken[row]
@@ -160,7 +161,7 @@ def agreement_of(evidence: Evidence, edge: Ints, motion: Floats, point: Floats, 
     shift = evidence.noise.translation_m[edge] ** 2
     shift_both = shift[first] + shift[second] + turn[first] * apart
     chi2 = angle**2 / (turn[first] + turn[second]) + np.einsum("ni,ni->n", moved, moved) / shift_both
-    return np.asarray(np.maximum(0.0, 1 - chi2 / GATE))
+    return np.asarray(np.maximum(0.0, 1 - chi2 / CLOSES_BELOW))
 
 
 def agreed_motions(votes: Votes, chosen: Ints, weight: Floats) -> Floats:

@@ -6,36 +6,39 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtri
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.complex.judging import MEDIAN_CHI2, has_unit_information, mean_variances
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
-MAXWELL_MEDIAN = math.sqrt(MEDIAN_CHI2[3])
-DEFAULT_ANGLE_RAD = 0.03
-DEFAULT_SHARE = 0.05
-"""Of an edge's usual length: its error where too few cycles close to estimate it."""
+DEFAULT_ANGLE_RAD, DEFAULT_SHARE = 0.03, 0.05
+"""An edge's errors where too few cycles close to estimate them, that of translation of its usual length."""
 ABOUT_A_POINT = 0.2
 """Of the usual step between views, where they all turn about one point, at which nothing moves."""
-FIRST_GATE_RAD = 0.35
-FIRST_GATE_SHARE = 0.6
+FIRST_GATE_RAD, FIRST_GATE_SHARE = 0.35, 0.6
+"""To which cycles may close that errors are estimated from, translation as a share of the reach."""
 LONGEST_CYCLE = 4
+"""Edges of those: errors of longer ones add up until any cycle seems to close."""
 FEWEST_CYCLES, SOME_CYCLES = 20, 4
+"""That must close to estimate errors, and that show how large they may be where fewer do."""
 COPIES = 1e-5
 """Of the gate: cycles that close so exactly join copies of one measurement, and are no evidence."""
 STATED = 3.0
 """Standard deviations of the graph's own information that explain a cycle."""
 NEARLY_ALL = 0.95
-MAXWELL_NEARLY_ALL = 2.795
+"""Of the cycles that close: if the stated information explains so many, errors are as large as it takes."""
+MAXWELL_MEDIAN, MAXWELL_NEARLY_ALL = math.sqrt(MEDIAN_CHI2[3]), math.sqrt(chdtri(3, 1 - NEARLY_ALL))
+"""Quantiles of the length of a vector of three normal errors."""
 GAP = 5.0
 """Of the error that nearly all cycles that close stay below."""
 HEAVY_TAILS = 1.9
 """Errors of registration have heavier tails than a Gaussian of the same median."""
 LEAST_CREDIBLE, MOST_CREDIBLE, TOLD_FROM = 0.2, 2.5, 2.0
 """Of the default error: the bounds within which a stated error is believed; and the factor of correction from which
-a note reports it."""
-
+a note reports it.
+"""
 LEVER = 1.8
 """Of the reach: how far around the working point lies what is seen, which an error of rotation moves along."""
 

@@ -20,7 +20,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.judging import squares_at_both_ends
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import PER_FOLD
-from hodge_pipeline.diagnosis.robust_poses import UNSETTLED, Fit
+from hodge_pipeline.diagnosis.robust_poses import UNSETTLED, Solved
 from hodge_pipeline.diagnosis.scene_model import SceneModel
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -51,13 +51,13 @@ class Placements:
     """
 
     evidence: Evidence
-    found: Fit
+    found: Solved
     model: SceneModel | None
     pairs: Ints
     row: Ints
 
     @classmethod
-    def of(cls, evidence: Evidence, found: Fit, model: SceneModel | None) -> Placements:
+    def of(cls, evidence: Evidence, found: Solved, model: SceneModel | None) -> Placements:
         """Those of a solution."""
         count, edges = evidence.graph.vertex_count, evidence.graph.edges
         directed = np.concatenate([edges, edges[:, ::-1]])
@@ -152,7 +152,7 @@ def consecutive_log_evidence(evidence: Evidence) -> Floats:
     return np.asarray(np.log1p(odds))
 
 
-def arrangement_log_evidence(evidence: Evidence, found: Fit, model: SceneModel) -> float:
+def arrangement_log_evidence(evidence: Evidence, found: Solved, model: SceneModel) -> float:
     """Log-evidence for a solution of a scene in which every pair was tried."""
     here, count = Placements.of(evidence, found, model), len(found.piece)
     together = found.piece[:, None] == found.piece[None]

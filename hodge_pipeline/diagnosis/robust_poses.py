@@ -35,7 +35,7 @@ LARGE = 20_000
 
 
 @dataclass(frozen=True)
-class Fit(Alignment):
+class Solved(Alignment):
     """Solved poses (V, 4, 4) at the working point, the piece (V,) of each, the χ² (E,) of every edge, allowing for
     the uncertainty of the poses (∞ between pieces), the edges that are used (E,), and the resistance (E,).
     """
@@ -50,7 +50,7 @@ class Fit(Alignment):
         return self.used & np.isinf(self.resistance)
 
 
-def fit(evidence: Evidence, alignment: Alignment, gates: tuple[float, ...], initial: InitialName = "given") -> Fit:
+def fit(evidence: Evidence, alignment: Alignment, gates: tuple[float, ...], initial: InitialName = "given") -> Solved:
     """The robust solution that an alignment leads to: for each gate in turn, the edges of a smaller χ² are solved.
 
     For gates wider than GATE quickly and with errors as large as the gate allows, which leads near it whatever the
@@ -71,11 +71,11 @@ def fit(evidence: Evidence, alignment: Alignment, gates: tuple[float, ...], init
     return found
 
 
-def _judged(evidence: Evidence, poses: Floats, piece: Ints, used: Bools, student_weight: Floats | float) -> Fit:
+def _judged(evidence: Evidence, poses: Floats, piece: Ints, used: Bools, student_weight: Floats | float) -> Solved:
     network = Network.of(evidence.graph.edges[used], evidence.graph.vertex_count)
     resistance = effective_resistance(evidence.graph.edges, used, network)
     chi2 = chi2_at(evidence, poses, piece, resistance, student_weight)
-    return Fit(piece, poses, chi2, chi2 < GATE, resistance)
+    return Solved(piece, poses, chi2, chi2 < GATE, resistance)
 
 
 def _solve(

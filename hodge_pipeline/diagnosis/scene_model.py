@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.robust_poses import Fit
+from hodge_pipeline.diagnosis.robust_poses import Solved
 from hodge_pipeline.types import Bools, Floats, Ints
 
 CEILING = 0.97
@@ -30,6 +30,7 @@ LEAST_SPREAD_RAD = 0.2
 FEWEST = 6
 """Views of a group that the model is fitted to: with fewer, the unknown up of the group fits too well."""
 ROUNDS, STEPS = 8, 5
+"""Of the fit, and of the up of each group: limits on cost."""
 CLEAR_SHARE, CLEAR_SPREAD_RAD = 0.8, 0.42
 """The least share and the largest spread of a model that is used; else its share becomes 0."""
 STARTS = np.concatenate([np.eye(3), np.array([[0, 1, 1], [0, -1, 1]]) / np.sqrt(2)])
@@ -162,7 +163,7 @@ class SceneModel:
     upright: Upright
 
 
-def learn_scene_model(evidence: Evidence, found: Fit) -> SceneModel:
+def learn_scene_model(evidence: Evidence, found: Solved) -> SceneModel:
     """The model fitted to the poses of a solution and the edges it uses."""
     count = len(found.piece)
     joined = np.zeros((count, count), bool)

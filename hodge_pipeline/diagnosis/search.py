@@ -19,13 +19,14 @@ from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import PER_FOLD, Alignment, agreement_of, mean_motions
 from hodge_pipeline.diagnosis.placement import Placements, consecutive_log_evidence, log_evidence
-from hodge_pipeline.diagnosis.robust_poses import ONCE, Fit, fit
+from hodge_pipeline.diagnosis.robust_poses import ONCE, Solved, fit
 from hodge_pipeline.diagnosis.scene_model import learn_scene_model
 from hodge_pipeline.types import Bools, Floats, Ints
 
 LARGEST = 150
 """Views: with more, all pairs of them would cost too much."""
 ROUNDS = 10
+"""Of moves: a limit on cost."""
 TRIED, TOGETHER = 200, 50_000
 """Motions in each round; and pairs of views, of all motions that are weighed at once, up to which calls cost more than
 what they do.
@@ -55,7 +56,7 @@ class Move:
     beside: Ints
 
 
-def searched(evidence: Evidence, found: Fit) -> Fit:
+def searched(evidence: Evidence, found: Solved) -> Solved:
     """The solution after the best moves, after the best ones then, and so on.
 
     Without a scene model, by which the cuts are weighed, the poses that moves lead to must make more edges agree, each
@@ -72,7 +73,7 @@ def searched(evidence: Evidence, found: Fit) -> Fit:
     return found
 
 
-def _made(found: Fit, moves: list[Move]) -> Alignment:
+def _made(found: Solved, moves: list[Move]) -> Alignment:
     """The alignment after the moves."""
     poses, piece = found.poses.copy(), found.piece.copy()
     for move in moves:

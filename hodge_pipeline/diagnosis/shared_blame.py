@@ -9,7 +9,7 @@ import numpy as np
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.cycles import Cycles
 from hodge_pipeline.diagnosis.evidence import Evidence
-from hodge_pipeline.diagnosis.robust_poses import Fit
+from hodge_pipeline.diagnosis.robust_poses import Solved
 from hodge_pipeline.types import Bools, Floats, Ints
 
 
@@ -32,7 +32,7 @@ class SharedBlame:
     undecided: Bools
 
 
-def share_blame(cycles: Cycles, fit: Fit, evidence: Evidence) -> SharedBlame:
+def share_blame(cycles: Cycles, fit: Solved, evidence: Evidence) -> SharedBlame:
     """Who shares the blame, in this alignment."""
     loops, count = cycles.loops, len(evidence.graph.edges)
     untold = (loops.sums_at_edges(cycles.closes, count) == 0) & ~evidence.in_no_listed_cycle

@@ -11,7 +11,9 @@ from hodge_pipeline.diagnosis.result import CONSISTENT, UNTESTABLE
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 LONGEST_NAMED = 12
+"""Vertices of a cycle whose names are all said."""
 ROUNDING = 1e-9
+"""Metres and degrees that are said to be none."""
 MOST_NAMED = 4
 """Edges that share a blame; of more the number."""
 TOO_LONG = "every loop through it is too long to be listed: nothing tests it"

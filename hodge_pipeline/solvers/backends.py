@@ -16,15 +16,13 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from hodge_pipeline.solvers.cg import solved_columns
 from hodge_pipeline.solvers.direct import factor_s, laplacian_step_s
 from hodge_pipeline.solvers.elimination import Elimination, Ordering, plan_elimination, unordered
-from hodge_pipeline.solvers.linear import Factor, factorise, fill_reducing_order
+from hodge_pipeline.solvers.linear import CHAIN_EDGES_PER_VERTEX, Factor, factorise, fill_reducing_order
 from hodge_pipeline.solvers.multigrid import Coarsening, Modes, Preconditioning, multigrid
 from hodge_pipeline.types import Floats, Ints
 
 BackendName: TypeAlias = Literal["auto", "superlu", "multigrid"]
 ITERATIVE_FROM = 15_000
 """Vertices: below, a factorisation and a hundred solves cost less than the hierarchies."""
-CHAIN_EDGES_PER_VERTEX = 1.5
-"""With more, so large a graph fills up: its order of elimination is not even looked for."""
 WIDEST = 20.0
 """Of the levels of what the block elimination leaves over, as a share of the square root of its vertices: those of
 towns of 20,000 to 80,000 poses are up to 16. Of wider ones, as in a tangle, the order itself would cost too much.
@@ -34,7 +32,9 @@ SECONDS_A_BLOCK = 2e-5
 LAPLACIAN_STEPS = 20
 """Of CG with the scalar Laplacians to a Newton step of such towns."""
 JOINT_SIZE = 6
+"""Rows of a block of rotations and translations together."""
 SCALAR_TOLERANCE, MAX_SCALAR_STEPS = 1e-12, 300
+"""Of conjugate gradients with one number to a vertex: as exact as a factorisation."""
 
 
 def choose(

@@ -34,6 +34,7 @@ CG_TOLERANCE, MAX_CG_STEPS = 1e-5, 50
 COARSEST = 500
 """Vertices: so few are solved in milliseconds."""
 LEAST_COARSENING = 0.8
+"""Of the vertices: a level that leaves more costs more than it saves."""
 SWEEPS = 8
 DAMPING = 0.7
 """Of a step to the neighbours' mean: whole steps would swing on graphs without odd cycles."""

@@ -16,6 +16,7 @@ from hodge_pipeline.types import Floats
 MINIMUM_DEGREE_TO = 300_000
 """Above this many vertices SuperLU's minimum degree costs more than the fill that it saves on chain-like graphs."""
 CHAIN_EDGES_PER_VERTEX = 1.5
+"""A graph of fewer is chain-like: hardly anything fills up, whatever the order of elimination."""
 SUPERLU_SIZES = {"relax": 1, "panel_size": 4}
 """No merging of small supernodes, narrow panels: on graphs' matrices a factorisation then takes 0.5 to 0.9 of the time
 that it takes with SuperLU's own sizes (10 and 20). Larger ones than those overrun its work space."""

@@ -28,8 +28,8 @@ FACTOR_WORTH = 5
 CHUNK, ROWS = 1 << 14, 1 << 11
 """Blocks, and block rows of a coarser matrix, that are taken at a time: their copies stay small."""
 LEAST_COARSENING = 0.8
-POWER_STEPS = 10
-SAFE_RADIUS = 1.05
+"""Of the vertices: a level that leaves more costs more than it saves."""
+POWER_STEPS, SAFE_RADIUS = 10, 1.05
 """The power method's estimate is a lower bound of the spectral radius."""
 CoarseSolver: TypeAlias = Callable[[csc_matrix], Callable[[Floats], Floats]]
 

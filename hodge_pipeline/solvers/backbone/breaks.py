@@ -191,15 +191,15 @@ def _mirrored(chain: Chain, twist: Floats) -> Floats:
 
 def _kinds(left: Floats, white: Floats) -> tuple[Floats, Floats, Bools]:
     """The centres (K, p) of kinds of steps, the share of the steps that are of each, and which steps are of one."""
-    size, gate = left.shape[1], ALIKE * left.shape[1]
+    size, gate = left.shape[1], OF_ONE_KIND * left.shape[1]
     other = (white**2).sum(axis=1) > gate
     centres, counts = [np.zeros(size)], [max(float((~other).sum()), 1.0)]
-    while other.sum() >= FEWEST_ALIKE and len(centres) < MOST_KINDS:
+    while other.sum() >= FEWEST_OF_KIND and len(centres) < MOST_KINDS:
         rows = np.flatnonzero(other)
         some = white[rows[:: -(-len(rows) // MOST_COMPARED)]]
         near = cKDTree(some).query_ball_point(some, np.sqrt(gate), return_length=True)
         alike = rows[((white[rows] - some[np.argmax(near)]) ** 2).sum(axis=1) <= gate]
-        if len(alike) < FEWEST_ALIKE:
+        if len(alike) < FEWEST_OF_KIND:
             break
         centres.append(np.median(left[alike], axis=0))
         counts.append(float(len(alike)))
@@ -207,7 +207,7 @@ def _kinds(left: Floats, white: Floats) -> tuple[Floats, Floats, Bools]:
     return np.stack(centres), np.array(counts) / len(left), ~other
 
 
-ALIKE, FEWEST_ALIKE = 3.0, 3
+OF_ONE_KIND, FEWEST_OF_KIND = 3.0, 3
 """χ² to an axis up to which steps are of one kind, and steps that a kind has at the least."""
 MOST_KINDS, MOST_COMPARED = 8, 2000
 """Limits on cost."""

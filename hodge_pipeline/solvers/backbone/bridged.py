@@ -33,7 +33,7 @@ from hodge_pipeline.solvers.backbone.places import MISTAKEN_PLACES, MOST_STEPS, 
 from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales
 from hodge_pipeline.types import Bools, Ints
 
-MOST_BREAKS, MOST_TRIED = 10, 2
+MOST_BREAKS, TRIED_AT_ONCE = 10, 2
 """That are bridged one after the other, and that are tried each time."""
 
 
@@ -118,7 +118,7 @@ def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
     fold = np.log(max((1 / loops_at_place(told.chain.places)).sum(), 1))  # of testimonies, one a place, for the best
     agreed = [each for each in agreed_breaks(told, usual) if each.log_evidence > BY_CHANCE + fold]
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
-    worth = [(each, least) for each in agreed[:MOST_TRIED] if each is agreed[0] or each.at != agreed[0].at]
+    worth = [(each, least) for each in agreed[:TRIED_AT_ONCE] if each is agreed[0] or each.at != agreed[0].at]
     if len(found.reduced.runs):
         runs = Runs.of(settled(Fit(found.reduced, found.linear), MOST_STEPS), usual)
         strained, speaks = runs.strained_break(), runs.score(np.array([each.at for each in unlike], np.int64))

@@ -59,6 +59,11 @@ class Chain:
         return len(self.axes) == 6
 
     @property
+    def turns(self) -> int:
+        """How many of a twist's free axes are rotations."""
+        return 3 if self.is_spatial else 1
+
+    @property
     def inner(self) -> Bools:
         """Positions (n,) that a step leads to."""
         return np.asarray((self.step_edge >= 0) | self.bridged)
@@ -203,8 +208,8 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
     ends = place[graph.edges[rows]]
     motion, loop_covariance = _directed(graph.i_from_j[rows], covariance[rows], ends[:, 0] > ends[:, 1], axes)
     usual = np.median(np.einsum("eii->ei", np.concatenate([step_covariance[at], loop_covariance])), axis=0)
-    step_covariance[at] += np.diag(EXACT**2 * usual)
-    loop_covariance += np.diag(EXACT**2 * usual)
+    step_covariance[at] += np.diag(SMALLEST_SIGMA**2 * usual)
+    loop_covariance += np.diag(SMALLEST_SIGMA**2 * usual)
     return Chain(
         order,
         path,
@@ -221,7 +226,7 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
     )
 
 
-EXACT = 0.03
+SMALLEST_SIGMA = 0.03
 """Of the usual standard deviation: none is believed to be much smaller. Beside one of a thousandth the normal
 equations lose what the other edges say; from .01 to .1 the manhattan graph is judged alike.
 """

@@ -83,15 +83,10 @@ def _shape(chain: Chain, poses: Floats, pairs: Ints, rng: np.random.Generator) -
     """The spread (p, p) of the residuals of loops between other positions (K, 2)."""
     motion = chain.motion[rng.integers(0, len(chain.motion), len(pairs))]
     residual = parallel(chain, motion, poses[pairs[:, 0]], poses[pairs[:, 1]])
-    moment, split = residual.T @ residual / max(len(residual), 1), turns(chain)
+    moment, split = residual.T @ residual / max(len(residual), 1), chain.turns
     shape = np.zeros_like(moment)
     shape[:split, :split], shape[split:, split:] = moment[:split, :split], moment[split:, split:]
     return shape
-
-
-def turns(chain: Chain) -> int:
-    """How many of a twist's free axes are rotations."""
-    return 1 if len(chain.axes) == 3 else 3
 
 
 def parallel(chain: Chain, motion: Floats, from_a: Floats, from_b: Floats) -> Floats:

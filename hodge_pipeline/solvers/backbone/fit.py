@@ -15,7 +15,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.chain import Chain
-from hodge_pipeline.solvers.backbone.sparse import Factored, Network
+from hodge_pipeline.solvers.backbone.sparse import Factored, NormalEquations
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
@@ -137,7 +137,7 @@ class Reduced:
     ends: Ints
     runs: Ints
     active: Ints
-    network: Network
+    network: NormalEquations
 
     @classmethod
     def of(cls, chain: Chain, active: Ints) -> Reduced:
@@ -146,7 +146,7 @@ class Reduced:
         after = np.flatnonzero(chain.path[ends[1:]] == chain.path[ends[:-1]])
         runs = np.stack([after, after + 1], axis=1)
         loops = np.searchsorted(ends, chain.ends[active])
-        return cls(ends, runs, active, Network.of(np.concatenate([runs, loops]), len(ends)))
+        return cls(ends, runs, active, NormalEquations.of(np.concatenate([runs, loops]), len(ends)))
 
     @property
     def of_runs(self) -> slice:
@@ -374,6 +374,7 @@ def from_rotations(bare: Fit, steps: int) -> Linear:
 
 
 LEAST_LEFT = 1e-6
+"""Of an edge's covariance, where rounding hides what the others say: it alone joins two parts."""
 
 
 def _without(own: Floats, across: Floats) -> Floats:

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import expit
 
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place, one_of_each_place
@@ -19,6 +20,7 @@ from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales
 from hodge_pipeline.types import Bools, Floats
 
 ROUNDS = 6
+"""In which loops are found that agree with the poses they lead to: a limit on cost."""
 
 
 @dataclass(frozen=True)
@@ -229,7 +231,7 @@ random loops in simulated graphs and in those of Bicocca and RobotCar, whose bes
 
 def _limit(judged: Judged) -> float:
     """The log Bayes factor that one wrong loop is expected to reach by chance, of as many as are likely to be wrong."""
-    return float(np.log(max((1 / (1 + np.exp(np.clip(judged.log_odds, -500, 500)))).sum(), 1)))
+    return float(np.log(max(expit(-judged.log_odds).sum(), 1)))
 
 
 MISTAKEN = float(np.log(20.0))

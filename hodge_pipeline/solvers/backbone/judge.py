@@ -11,6 +11,7 @@ from hodge_pipeline.solvers.backbone.fit import Fit, Linear, root
 from hodge_pipeline.types import Floats, Ints
 
 SAMPLES = 64
+"""Draws of the ends' errors: what they say of a standard deviation is off by a tenth."""
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from hodge_pipeline.solvers.backbone.scales import decoys
 from hodge_pipeline.types import Bools, Floats, Ints
 
 MOST_STEPS = 15
+"""Of Gauss–Newton: a limit on cost."""
 ALIKE = 0.75
 """Of a place's loops: a used place of as many that contradicts it is its rival, as is an unused one of all as many."""
 MISTAKEN_PLACES = 0.2
@@ -30,13 +31,14 @@ MISTAKEN_PLACES = 0.2
 a path that closes once would stay open: its loops can say little more than that the drift is as stated.
 """
 ROUNDS = 6
+"""In which places that agree with the strongest are found: a limit on cost."""
 MOST_TRIED = 3
 """Places that are left out, or added, on trial each time, and groups of loops that may be added: limits on cost."""
 CLEARLY = float(np.log(20.0))
 """Log-odds that a change must win."""
 ADJACENT = 2.0
 """Places between places that follow each other: a corridor that is mistaken for another is one testimony."""
-LONGEST = 5.0
+LONGEST_CORRIDOR = 5.0
 """Places of a mistaken corridor, of 20 steps or more each: a longer run is as many testimonies as it has such parts.
 Without a limit none of 52 loops of a second lap counted, each of which says nothing alone beside 160 m of drift.
 """
@@ -208,12 +210,12 @@ class Places:
 
 
 def _cut(run: Ints, ends: Floats) -> Ints:
-    """The runs (K,) of places, of which loops have these ends (K, 2), cut into parts of up to `LONGEST`."""
+    """The runs (K,) of places, of which loops have these ends (K, 2), cut into parts of up to `LONGEST_CORRIDOR`."""
     part, after = np.empty_like(run), 0
     for number in range(run.max(initial=-1) + 1):
         rows = np.flatnonzero(run == number)
         along = ends[rows, np.ptp(ends[rows], axis=0).argmax()]
-        at = ((along - along.min()) / LONGEST).astype(np.int64)
+        at = ((along - along.min()) / LONGEST_CORRIDOR).astype(np.int64)
         part[rows] = after + np.unique(at, return_inverse=True)[1]
         after = int(part[rows].max()) + 1
     return part

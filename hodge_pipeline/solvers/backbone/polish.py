@@ -20,8 +20,8 @@ CROWDED_POWER = 0.5
 """The power of the number of loops at one place by which their variances are larger: 0 for errors that are independent,
 1 for the same error in all.
 """
-ROUNDS = 5
-STEPS = 3
+ROUNDS, STEPS = 5, 3
+"""Times that weights are taken anew, and Gauss–Newton's steps for each: limits on cost."""
 SAME_WEIGHT = 0.01
 """Loops whose weights change by less are not solved for again."""
 

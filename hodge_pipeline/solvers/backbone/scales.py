@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from hodge_pipeline.solvers.backbone.breaks import Testimony
 from hodge_pipeline.solvers.backbone.chain import MOST_OF_A_STEP, Chain
-from hodge_pipeline.solvers.backbone.evidence import EVEN, Wrong, WrongLoops, mixture, student, turns
+from hodge_pipeline.solvers.backbone.evidence import EVEN, Wrong, WrongLoops, mixture, student
 from hodge_pipeline.solvers.backbone.fit import linearise
 from hodge_pipeline.types import Floats, Ints
 
@@ -26,7 +26,7 @@ the identity that stands for unknown, rotation and translation have each a unit 
 """
 FARTHEST = 3 * np.log(4.0)
 """Where information is stated, the search begins at such units alone: one that is nearer explains mistaken places."""
-BY_CHANCE = float(np.log(100.0))
+LIKELIER_BY = float(np.log(100.0))
 """Nats by which loops must be likelier there."""
 DECOYS = 4
 """To a loop: with one, scales of loops differed up to eightfold from one draw to the next."""
@@ -60,7 +60,7 @@ class Scales:
 
     def units(self, chain: Chain) -> tuple[Floats, Floats]:
         """The factor on each free axis (p,), of steps and of loops."""
-        split, size = turns(chain), len(chain.axes)
+        split, size = chain.turns, len(chain.axes)
         pairs = (self.step_turn, self.step_shift), (self.loop_turn, self.loop_shift)
         step, loop = (np.repeat(pair, (split, size - split)) for pair in pairs)
         return step, loop
@@ -105,7 +105,7 @@ def learn_scales(chain: Chain, wrong: Wrong) -> tuple[Scales, Floats]:
     tried = tried[values[tried] > found[1]] if chain.stated else tried
     others = [_likeliest(value, unit) for unit in units[tried].tolist()]
     other = max(others, key=lambda each: each[1], default=found)
-    found = other if other[1] > found[1] + BY_CHANCE else found
+    found = other if other[1] > found[1] + LIKELIER_BY else found
     logs = np.minimum(found[0], most)
     return Scales(*map(float, np.exp(logs))), own.value(logs)[1]
 
@@ -136,7 +136,7 @@ def _most(chain: Chain) -> Floats:
     most = np.full(4, np.inf)
     steps = (chain.step_edge >= 0) & ~chain.bridged
     moved, spread = chain.log(chain.step[steps]), np.sqrt(np.einsum("mii->mi", chain.step_covariance[steps]))
-    for kind, axes in enumerate((slice(0, turns(chain)), slice(turns(chain), None))):
+    for kind, axes in enumerate((slice(0, chain.turns), slice(chain.turns, None))):
         size, unit = np.linalg.norm(moved[:, axes]), np.linalg.norm(spread[:, axes])
         if size > 0 and unit > 0 and not (chain.stated and kind == 0):
             most[kind] = max(np.log(MOST_OF_A_STEP * size / unit), 0.0 if chain.stated else -np.inf)

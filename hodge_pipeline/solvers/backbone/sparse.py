@@ -27,8 +27,8 @@ rounds of fewer take longer.
 
 
 @dataclass(frozen=True)
-class Network:
-    """Vertices joined by edges (E, 2), one of each `component (N,)` held still.
+class NormalEquations:
+    """The pattern of the normal equations of vertices joined by edges (E, 2), one of each `component (N,)` held still.
 
     - `place (N,)`: of each vertex in the plan's order, those held still from `plan.size` on; `slot (E,)`: of each
       edge's block above the diagonal, −1 where an end is held still.
@@ -41,7 +41,7 @@ class Network:
     plan: Elimination
 
     @classmethod
-    def of(cls, edges: Ints, count: int) -> Network:
+    def of(cls, edges: Ints, count: int) -> NormalEquations:
         """The network of these edges, none from a vertex to itself."""
         component = connected_components(edges, count)
         held = first_of_component(component)
@@ -90,7 +90,7 @@ def _as_they_are(pattern: csc_matrix) -> Ordering:
 class Factored:
     """A factorised network: `core` is what the rounds leave."""
 
-    network: Network
+    network: NormalEquations
     carry: Floats
     blocks: BlockFactor
     core: Floats

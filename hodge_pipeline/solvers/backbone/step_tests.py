@@ -16,7 +16,7 @@ TESTED = 0.3
 """Of the steps in short cycles that close: from there on every edge is judged, none trusted at first. On graphs of
 rooms .77 to .98 are, on those of places visited again 0 to .1, and as many as there are edges over two steps or three.
 """
-LONGEST = 3
+LONGEST_CYCLE = 3
 """Steps of a cycle with one loop: cycles of several loops close too where these agree on a place that is wrong."""
 OF_STEPS = 3.0
 """Of the usual displacement and angle of steps: a cycle of right edges closes to less, and one of places at random
@@ -27,7 +27,7 @@ seldom does.
 def is_tested(chain: Chain) -> bool:
     """Whether cycles of one loop that close to less than a step test so many steps that none needs to be trusted."""
     (low, high), poses = chain.ends.T, chain.poses
-    short = np.flatnonzero((chain.path[low] == chain.path[high]) & (high - low <= LONGEST))
+    short = np.flatnonzero((chain.path[low] == chain.path[high]) & (high - low <= LONGEST_CYCLE))
     closing = short[closes(chain.motion[short], _between(poses, low[short], high[short]), gate(chain))]
     return bool((chain.over(chain.ends[closing]) > 0).sum() > TESTED * (chain.step_edge >= 0).sum())
 
@@ -40,10 +40,10 @@ def contradicted_from_afar(graph: ViewGraph, kept: Bools) -> tuple[int, int, int
     chain = make_chain(graph, sequential_edges(graph))
     inner = chain.step_edge >= 0
     ends = chain.ends[kept[chain.loop_edge]]
-    near = [ends[np.diff(ends, axis=1)[:, 0] <= LONGEST]]
+    near = [ends[np.diff(ends, axis=1)[:, 0] <= LONGEST_CYCLE]]
     left_out = ~np.append(kept, True)[chain.step_edge]
     if len(ends):
-        two = np.sort(ends[cKDTree(ends).query_pairs(LONGEST, p=np.inf, output_type="ndarray")], axis=1)
+        two = np.sort(ends[cKDTree(ends).query_pairs(LONGEST_CYCLE, p=np.inf, output_type="ndarray")], axis=1)
         low, high = np.diff(np.cumsum(left_out | ~inner)[two], axis=1)[:, 0].T
         near += [two[(low == 1) & (high == 0), :, 0], two[(low == 0) & (high == 1), :, 1]]
     out = inner & left_out

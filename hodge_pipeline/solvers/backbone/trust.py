@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import expit
 
 from hodge_pipeline.complex.judging import chi2_by_information, has_unit_information, tail_gate, tail_weight
 from hodge_pipeline.errors import GraphError
@@ -37,7 +38,7 @@ loops must join: one path 10, ten or more 100.
 """
 COVERED = 0.9
 """Of the vertices that consecutive edges must join, so that a sequence is a backbone."""
-AGREEING = 0.05
+AGREEING_REFUSED = 0.05
 """Where loops are many: to each step, loops that the backbone refuses though they agree with each other, from where on
 it may be the backbone that is wrong: see `backbone_anyway`.
 """
@@ -57,6 +58,7 @@ class Backbone:
     - `world_from_cam (V, 4, 4)`: each path begins at the identity where no loop ties it.
     - `doubted`: whether many loops agree with each other and not with the backbone, which may be what is wrong, or say
       that it is broken at several steps.
+    - `named`: what its edges are called.
     """
 
     chain: Chain
@@ -70,6 +72,7 @@ class Backbone:
     contradicted: Bools
     world_from_cam: Floats
     doubted: bool
+    named: str = "consecutive edges"
 
     def weighted(self, graph: ViewGraph) -> ViewGraph:
         """The graph of the edges that count, with the information that their errors were found to have."""
@@ -105,7 +108,7 @@ class Backbone:
         """What was trusted and what that led to."""
         loops, used, more = len(self.chain.loop_edge), int(self.loops_used.sum()), int(self.part.sum())
         again = f" and {more} that state the same steps again" if more else ""
-        trusted = f"{int(self.steps.sum()) - more} consecutive edges{again} are trusted as a backbone"
+        trusted = f"{int(self.steps.sum()) - more} {self.named}{again} are trusted as a backbone"
         if not self.found.confirmed:
             return f"{trusted}, {counted(loops, 'loop')} that nothing confirms: the poses are the backbone's"
         broken = int((self.steps & ~self.used).sum())
@@ -138,7 +141,10 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) 
     one = fused(graph, again)
     one = windowed(one) if trust in (AUTO, SEQUENTIAL) else one
     backbone = _found(one.graph, trust, anyway)
-    return backbone and _of_all_edges(graph, backbone, one)
+    if backbone is None:
+        return None
+    named = backbone.named if trust in (AUTO, SEQUENTIAL) else f"edges of {trust}"
+    return _of_all_edges(graph, replace(backbone, named=named), one)
 
 
 def _found(graph: ViewGraph, trust: str, anyway: bool) -> Backbone | None:
@@ -166,7 +172,7 @@ def _found(graph: ViewGraph, trust: str, anyway: bool) -> Backbone | None:
     chain, found = inferred
     broken = chain.broken.sum() >= FEW_BREAKS
     agree = agreeing_loops(found.scales.applied(chain), ~found.used) if many_loops else 0
-    doubted = many_loops and bool(broken or agree > AGREEING * steps.sum())
+    doubted = many_loops and bool(broken or agree > AGREEING_REFUSED * steps.sum())
     if anyway or len(found.reduced.active) >= found.used.sum():
         return _backbone(graph, chain, found, found.polished, steps, doubted)
     trusted = steps.copy()
@@ -194,7 +200,7 @@ def _backbone(
     used, right, chi2 = steps.copy(), np.full(graph.edge_count, np.nan), np.full(graph.edge_count, np.nan)
     used[chain.loop_edge] = found.used
     used[chain.step_edge[chain.broken]] = False
-    probability = 1 / (1 + np.exp(-np.clip(found.judged.log_odds, -500, 500)))
+    probability = expit(found.judged.log_odds)
     right[chain.loop_edge] = np.where(found.used, probability, np.minimum(probability, UNUSED))
     chi2[chain.loop_edge] = found.judged.chi2
     poses = np.empty((graph.vertex_count, 4, 4))

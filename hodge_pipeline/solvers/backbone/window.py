@@ -22,11 +22,11 @@ from hodge_pipeline.solvers.backbone.chain import (
     sequential_edges,
     steps_apart,
 )
-from hodge_pipeline.solvers.backbone.evidence import squares, turns
+from hodge_pipeline.solvers.backbone.evidence import squares
 from hodge_pipeline.solvers.backbone.fit import inverse, linearise
 from hodge_pipeline.solvers.backbone.judge import by_path
 from hodge_pipeline.solvers.backbone.parallel import Fused
-from hodge_pipeline.solvers.backbone.step_tests import AS_STATED, LONGEST, LOOPS_AT_A_STEP, TESTED, closes, gate
+from hodge_pipeline.solvers.backbone.step_tests import AS_STATED, LONGEST_CYCLE, LOOPS_AT_A_STEP, TESTED, closes, gate
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.reweighted import SETTLED
 from hodge_pipeline.types import Floats, Ints, ViewGraph
@@ -36,6 +36,7 @@ AGREEING = 0.9
 was tried, .69 to .84 do, of the cubicle's .6; of graphs whose odometry has a window nearly all.
 """
 ROUNDS = 10
+"""Times that poses are solved for, while edges change sides: a limit on cost."""
 TOLERANCE, LEAST = 1e-4, 1e-9
 """How precisely their poses are solved for, of χ²; and the least weight, so that they do not fall into pieces."""
 
@@ -46,7 +47,7 @@ def windowed(one: Fused) -> Fused:
     """
     graph = one.graph
     steps, apart = sequential_edges(graph), steps_apart(graph)
-    if ((apart > 0) & (apart <= LONGEST)).sum() <= (1 + LOOPS_AT_A_STEP) * steps.sum():
+    if ((apart > 0) & (apart <= LONGEST_CYCLE)).sum() <= (1 + LOOPS_AT_A_STEP) * steps.sum():
         return one  # nor need a chain be made for it
     chain = make_chain(graph, steps)
     at, near = np.flatnonzero(chain.step_edge >= 0), _near(chain)
@@ -91,7 +92,7 @@ def _near(chain: Chain) -> Ints:
 def _many(chain: Chain, rows: Ints) -> bool:
     """Whether so many of these loops pass over two steps or three, and over so many steps, as a window has."""
     steps, ends = chain.step_edge >= 0, chain.ends[rows]
-    short = ends[np.diff(ends, axis=1)[:, 0] <= LONGEST]
+    short = ends[np.diff(ends, axis=1)[:, 0] <= LONGEST_CYCLE]
     many = len(short) > LOOPS_AT_A_STEP * steps.sum()
     return bool(many and (chain.over(short)[steps] > 0).sum() > TESTED * steps.sum())
 
@@ -102,8 +103,8 @@ def _as_they_close(chain: Chain, near: Ints) -> Chain:
     """
     ends, variance = chain.ends[near], np.empty(len(chain.axes))
     squares = linearise(chain, chain.poses).loops[0][near] ** 2 / np.diff(ends, axis=1)
-    unit = float(np.mean(chain.log(chain.step)[:, turns(chain) :] ** 2))
-    for kind, least in ((slice(0, turns(chain)), 1.0), (slice(turns(chain), None), max(unit, EXACT))):
+    unit = float(np.mean(chain.log(chain.step)[:, chain.turns :] ** 2))
+    for kind, least in ((slice(0, chain.turns), 1.0), (slice(chain.turns, None), max(unit, EXACT))):
         variance[kind] = max(np.median(squares[:, kind]) / MEDIAN_CHI2[1] / 2, EXACT**2 * least)
     step, loop = np.zeros_like(chain.step_covariance), chain.covariance.copy()
     step[chain.step_edge >= 0] = np.diag(variance)
