@@ -88,6 +88,31 @@ def test_two_broken_steps_are_named() -> None:
     assert np.flatnonzero(found.verdict[:399] == "wrong").tolist() == [90, 310]
 
 
+@pytest.mark.parametrize("wrong", [0.0, 0.5])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_robot_that_was_carried_or_thought_that_it_stood_still_goes_on_where_loops_say(
+    dimension: int, wrong: float
+) -> None:
+    made = drive(seed=0, count=500, world="town", wrong=wrong, loops=120, dimension=dimension)
+    standing = made.graph.i_from_j.copy()
+    standing[200:215] = np.eye(4)
+    kept = np.delete(np.arange(500), np.arange(200, 215))
+    rows = np.isin(made.graph.edges, kept).all(axis=1)
+    edges = np.concatenate([made.graph.edges[rows], [[199, 215]]])
+    motion = np.concatenate([made.graph.i_from_j[rows], made.graph.i_from_j[199:200]])  # a step like the one before
+    information = np.concatenate([made.graph.information[rows], made.graph.information[199:200]])
+    carried = ViewGraph.from_edges(
+        np.arange(485), np.searchsorted(kept, edges), motion, information, dimension=dimension
+    )
+    for drove in (
+        replace(made, graph=replace(made.graph, i_from_j=standing)),
+        replace(made, graph=carried, truth=made.truth[kept]),
+    ):
+        backbone = find_backbone(drove.graph)
+        assert backbone is not None and backbone.chain.broken.sum() == 1
+        assert drove.error_m(backbone.world_from_cam) < 0.5 * drove.error_m(drove.odometry())
+
+
 @pytest.mark.parametrize("wrong", [0.0, 0.5, 0.9, 1.0])
 def test_no_right_step_is_called_wrong(wrong: float) -> None:
     for seed in range(4):

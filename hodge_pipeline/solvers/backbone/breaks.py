@@ -19,12 +19,6 @@ NEIGHBOURS, SEEDS = 8, 16
 """Loops that each is compared with first, and those that are then compared with all: a limit on cost."""
 PLATEAU = 12.0
 """Nats: a step at which the loops' evidence is lower by more is not where the chain is broken."""
-CARRIED = 40.0
-"""Nats that speak against a step which is as no usual step is: loops of three places together say as much. Where one
-corridor is mistaken for another, loops of up to that many places agree, and no usual step explains them; a step that is
-measured wrong was a usual one. Of simulated breaks of 5 m and 30° all have a usual step, of corridors of 30 to 60 steps
-that were mistaken none.
-"""
 TAIL = 0.1
 """Share of the most unusual steps, whose sizes tell how often one is larger still (Hill 1975)."""
 MOST_UNUSUAL = 3
@@ -36,13 +30,14 @@ ROUNDS, LEAST = 10, 1e-6
 @dataclass(frozen=True)
 class Break:
     """The position `at` of a step that may be broken, its motion (4, 4) and covariance (p, p) in its place, and the
-    log-evidence of loops from several places.
+    log-evidence of loops from several places; `usual`: whether the motion is as steps usually are.
     """
 
     at: int
     motion: Floats
     covariance: Floats
     log_evidence: float
+    usual: bool = True
 
 
 @dataclass(frozen=True)
@@ -214,18 +209,27 @@ MOST_KINDS, MOST_COMPARED = 8, 2000
 
 
 def agreed_breaks(told: Testimony, usual: Usual) -> list[Break]:
-    """The likeliest break that each of the loops that others agree with asks for, the likeliest first."""
+    """The likeliest breaks that each of the loops that others agree with asks for, where a usual step explains it and
+    where none does, the likeliest first.
+    """
     chain = told.chain
     rows = np.flatnonzero(chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]])
     out = []
     for seed, factor in told.seeds(rows):
         low, high = chain.ends[seed]
         at = np.arange(low + 1, high + 1)
-        score = chain.over(chain.ends[rows], told.gains(seed, rows, factor))[at]
+        gain = told.gains(seed, rows, factor)
+        score = chain.over(chain.ends[rows], gain)[at]
         at, score = at[score > score.max() - PLATEAU], score[score > score.max() - PLATEAU]
         fits = _fits(told, usual, np.full(len(at), seed), at) - told.away[seed]
-        score = score + np.where(fits > 0, fits, -CARRIED) - told.explained[seed] + usual.unusual[at]
-        out.append(_break(told, usual, seed, at, score))
+        score = score + np.maximum(fits, 0.0) - told.explained[seed] + usual.unusual[at]
+        fit = fits > 0
+        if fit.any():
+            out.append(_break(told, usual, seed, at[fit], score[fit]))
+        if not fit.all():
+            far = _far_break(told, seed, at[~fit], score[~fit])
+            if chain.corridors_over(far.at, rows[(factor > 0) & (gain > 0)]) > 1:  # else no trial will show as many
+                out.append(far)
     return sorted(out, key=lambda each: -each.log_evidence)
 
 
@@ -254,6 +258,22 @@ def _break(told: Testimony, usual: Usual, loop: int, at: Ints, score: Floats) ->
     wide = usual.covariance * max(1.0, 1 / float(tail_weight(chi2, off.shape[1])))
     towards = wide @ np.linalg.solve(wide + covariance[0], off[kind])
     return Break(int(one[0]), usual.centres[kind] @ told.chain.exp(towards), wide, float(score[row]))
+
+
+def _far_break(told: Testimony, loop: int, at: Ints, score: Floats) -> Break:
+    """The break at the position of the highest score (K,): a motion as far as the loop asks for, as of a robot that was
+    carried, or that took itself to stand still.
+    """
+    row = int(np.argmax(score))
+    one = at[row : row + 1]
+    end, covariance = told.beyond(np.array([loop]), one - 1, one)
+    motion = se3.inverse(told.linear.poses[one[0] - 1]) @ end[0]
+    motion[:3, :3] = se3.project_to_so3(motion[:3, :3])
+    return Break(int(one[0]), motion, LOOSE**2 * covariance[0], float(score[row]), usual=False)
+
+
+LOOSE = 2.0
+"""Of the standard deviations of the one loop that says how a bridge leads, those of the bridge."""
 
 
 def unusual_breaks(usual: Usual) -> list[Break]:

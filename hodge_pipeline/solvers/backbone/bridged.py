@@ -10,6 +10,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.breaks import (
+    LOOSE,
     Break,
     Runs,
     Testimony,
@@ -104,7 +105,9 @@ def _better(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]
     for broken, least in [each for one in founds for each in _candidates(chain, one)]:
         tried = bridged(chain, broken)
         same = judge(tried, scales=found.scales)  # so that nothing but the step differs
-        if same is not None and same.log_evidence > found.log_evidence + least:
+        if same is None or same.log_evidence <= found.log_evidence + least:
+            continue
+        if broken.usual or chain.corridors_over(broken.at, np.flatnonzero(same.used)) > 1:
             return tried, judge(tried) or same
     return None
 
@@ -117,6 +120,7 @@ def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
     usual, least = Usual.of(chain), by_chance(len(factor))
     fold = np.log(max((1 / loops_at_place(told.chain.places)).sum(), 1))  # of testimonies, one a place, for the best
     agreed = [each for each in agreed_breaks(told, usual) if each.log_evidence > BY_CHANCE + fold]
+    far, agreed = [each for each in agreed if not each.usual], [each for each in agreed if each.usual]
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
     worth = [(each, least) for each in agreed[:TRIED_AT_ONCE] if each is agreed[0] or each.at != agreed[0].at]
     if len(found.reduced.runs):
@@ -125,7 +129,8 @@ def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
         unlike = [each for each, score in zip(unlike, speaks, strict=True) if score > BY_CHANCE]
         if strained is not None and strained.log_evidence > BY_CHANCE:
             worth.append((strained, BY_CHANCE - strained.log_evidence))
-    return worth + [(each, max(least - each.log_evidence, BY_CHANCE)) for each in unlike]
+    worth += [(each, max(least - each.log_evidence, BY_CHANCE)) for each in unlike]
+    return worth + [(each, least) for each in far[:1]]
 
 
 def bridged(chain: Chain, broken: Break) -> Chain:
@@ -218,7 +223,3 @@ def _mistaken(size: int, others: Ints) -> float:
     others = others[others > 1]
     count, total = len(others), float(others.sum())
     return float(np.log(MISTAKEN_PLACES + count) - (count + 1) * np.log1p(size / (total + 1)))
-
-
-LOOSE = 2.0
-"""Of the standard deviations of the one loop by which two paths are joined, those of their bridge."""

@@ -13,9 +13,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import pdtrc
 
-from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.solvers.backbone.breaks import Testimony
-from hodge_pipeline.solvers.backbone.chain import loops_at_place, one_of_each_place
+from hodge_pipeline.solvers.backbone.chain import corridors, loops_at_place, one_of_each_place
 from hodge_pipeline.solvers.backbone.evidence import EVEN, Wrong, log_student, student
 from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, settled, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, by_path, judge
@@ -36,12 +35,6 @@ MOST_TRIED = 3
 """Places that are left out, or added, on trial each time, and groups of loops that may be added: limits on cost."""
 CLEARLY = float(np.log(20.0))
 """Log-odds that a change must win."""
-ADJACENT = 2.0
-"""Places between places that follow each other: a corridor that is mistaken for another is one testimony."""
-LONGEST_CORRIDOR = 5.0
-"""Places of a mistaken corridor, of 20 steps or more each: a longer run is as many testimonies as it has such parts.
-Without a limit none of 52 loops of a second lap counted, each of which says nothing alone beside 160 m of drift.
-"""
 FEW_UNUSED = 0.1
 """Of the loops: with fewer, mistaken corridors are not reckoned with, and each place counts. Looked at on a walk all of
 whose loops are right, and on graphs of which four fifths or half are wrong, not between.
@@ -91,8 +84,7 @@ class Places:
         loops = loops_at_place(ends[rows])[np.searchsorted(rows, place)]
         run = np.arange(len(place))
         if len(used) - len(rows) > FEW_UNUSED * len(used):
-            adjacent = cKDTree(ends[place]).query_pairs(ADJACENT, p=np.inf, output_type="ndarray")
-            run = _cut(connected_components(adjacent, len(place)), ends[place])
+            run = corridors(ends[place])
         by_size = np.lexsort((-loops, run))
         first = by_size[np.unique(run[by_size], return_index=True)[1]]
         groups = agreeing_groups(Testimony.of(start, alone.wrong), np.flatnonzero(distance > 1.0))
@@ -207,18 +199,6 @@ class Places:
             bent = np.argsort(-chi2, kind="stable")
             out = [found.right & (each != place) for place in active[bent[worth[bent] < 0][:MOST_TRIED]]]
         return out + [found.right | (each == place) for place in np.flatnonzero(~self.used & ~found.right)]
-
-
-def _cut(run: Ints, ends: Floats) -> Ints:
-    """The runs (K,) of places, of which loops have these ends (K, 2), cut into parts of up to `LONGEST_CORRIDOR`."""
-    part, after = np.empty_like(run), 0
-    for number in range(run.max(initial=-1) + 1):
-        rows = np.flatnonzero(run == number)
-        along = ends[rows, np.ptp(ends[rows], axis=0).argmax()]
-        at = ((along - along.min()) / LONGEST_CORRIDOR).astype(np.int64)
-        part[rows] = after + np.unique(at, return_inverse=True)[1]
-        after = int(part[rows].max()) + 1
-    return part
 
 
 def agreeing_groups(told: Testimony, rows: Ints) -> list[Ints]:
