@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +54,12 @@ def kind_of(annotation: object) -> Kind | None:
 
 
 @cache
+def _installed() -> EntryPoints:
+    """All of every package: each time they are asked for, Python reads them anew, whatever the group."""
+    return entry_points()
+
+
+@cache
 def _entries(group: str) -> dict[str, EntryPoint]:
     """Entry points by name; of two with one name, the one of this project wins, else the first by package name."""
 
@@ -62,7 +68,7 @@ def _entries(group: str) -> dict[str, EntryPoint]:
         return package == "hodge-pipeline", package
 
     found: dict[str, EntryPoint] = {}
-    for entry in sorted(entry_points(group=group), key=rank):
+    for entry in sorted(_installed().select(group=group), key=rank):
         found[entry.name] = entry
     return found
 
