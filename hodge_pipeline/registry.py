@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import EntryPoint, EntryPoints, entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +54,8 @@ def kind_of(annotation: object) -> Kind | None:
 
 
 @cache
-def _installed() -> EntryPoints:
-    """All of every package: each time they are asked for, Python reads them anew, whatever the group."""
+def _installed() -> Any:  # its type is another one from Python 3.12 on
+    """The entry points of all packages: Python reads them anew each time it is asked for a group."""
     return entry_points()
 
 
