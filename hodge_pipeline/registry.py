@@ -54,6 +54,12 @@ def kind_of(annotation: object) -> Kind | None:
 
 
 @cache
+def _installed() -> Any:  # its type is another one from Python 3.12 on
+    """The entry points of all packages: Python reads them anew each time it is asked for a group."""
+    return entry_points()
+
+
+@cache
 def _entries(group: str) -> dict[str, EntryPoint]:
     """Entry points by name; of two with one name, the one of this project wins, else the first by package name."""
 
@@ -62,7 +68,7 @@ def _entries(group: str) -> dict[str, EntryPoint]:
         return package == "hodge-pipeline", package
 
     found: dict[str, EntryPoint] = {}
-    for entry in sorted(entry_points(group=group), key=rank):
+    for entry in sorted(_installed().select(group=group), key=rank):
         found[entry.name] = entry
     return found
 

@@ -26,8 +26,6 @@ def write_metadata(package: Path, folder: Path) -> None:
 @contextmanager
 def installed(*folders: Path) -> Iterator[None]:
     """Packages with their metadata found by this process and by those it starts; afterwards they were never there."""
-    from hodge_pipeline import registry
-
     before = set(sys.modules)
     paths = [*map(str, folders), *filter(None, [os.environ.get("PYTHONPATH")])]
     try:
@@ -35,10 +33,17 @@ def installed(*folders: Path) -> Iterator[None]:
             patch.setenv("PYTHONPATH", os.pathsep.join(paths))
             for folder in folders:
                 patch.syspath_prepend(str(folder))
-            registry._entries.cache_clear()
+            _forget_entries()
             yield
     finally:
-        registry._entries.cache_clear()
+        _forget_entries()
         for name in set(sys.modules) - before:
             if Path(getattr(sys.modules[name], "__file__", None) or ".").parent in folders:
                 del sys.modules[name]
+
+
+def _forget_entries() -> None:
+    from hodge_pipeline import registry
+
+    registry._installed.cache_clear()
+    registry._entries.cache_clear()

@@ -60,6 +60,18 @@ def test_importing_the_package_imports_nothing_else() -> None:
     assert done.stdout == "[]\n", done.stderr
 
 
+def test_a_graph_is_read_and_solved_without_libraries_that_few_graphs_need() -> None:
+    done = python("""
+import sys
+from hodge_pipeline import registry
+from hodge_pipeline.cli import diagnose, solve
+for name in registry.names("readers"):
+    registry.load("readers", name)
+print({"jinja2", "matplotlib", "open3d", "pycolmap", "rerun", "scipy.optimize"} & sys.modules.keys())
+""")
+    assert done.stdout == "set()\n", done.stderr
+
+
 def surface(count: int = 3000) -> np.ndarray:
     """Points of a corner of three walls, in metres, the same every time."""
     rng = np.random.default_rng(0)

@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize
 from scipy.special import expit
 
 from hodge_pipeline.diagnosis.evidence import Evidence
@@ -56,6 +55,8 @@ class Joining:
 
 def learn_joining(poses: Floats, piece: Ints, joined: Bools, reach_m: float) -> Joining:
     """The most probable model for poses (V, 4, 4) in pieces (V,), of which the pairs `joined (V, V)` have an edge."""
+    from scipy.optimize import minimize  # which takes .1 s, and not every graph needs it
+
     a, b = np.triu_indices(len(piece), 1)
     inside = piece[a] == piece[b]
     a, b = a[inside], b[inside]

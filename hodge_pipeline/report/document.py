@@ -7,12 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from hodge_pipeline.types.text import markdown_table, with_symbols
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 Mark: TypeAlias = Literal["", "better", "same", "worse", "mixed", "not measured"]
 JPEG = b"\xff\xd8"
@@ -138,6 +140,8 @@ def markdown(tables: Sequence[Table]) -> str:
 
 @cache
 def _template() -> Template:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True, lstrip_blocks=True,
         undefined=StrictUndefined, keep_trailing_newline=True,

@@ -4,6 +4,7 @@ back after it, and cycles of objects are looked for seldom.
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import gc
 from contextlib import suppress
@@ -22,8 +23,12 @@ twice the largest of them is free, and takes them anew, cleared, for the next fr
 
 
 def keep_memory() -> None:
-    """Do so from now on in this process; freed memory is given back as ever where the C library is not glibc."""
+    """Do so from now on in this process; freed memory is given back as ever where the C library is not glibc.
+
+    At its end no cycle is looked for: all of its objects, most of them those of imports, would be gone through twice.
+    """
     gc.set_threshold(COLLECT_AFTER)
+    atexit.register(gc.freeze)
     with suppress(OSError, AttributeError, TypeError):  # another C library; Windows has no library without a name
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(_MMAP_THRESHOLD, LARGEST_KEPT)

@@ -10,6 +10,7 @@ import mmap
 import os
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -40,9 +41,9 @@ def check_words(paths: Sequence[Path]) -> None:
     for path in paths:
         for line, text in text_lines(path):
             words = text.split(maxsplit=9)[:9] if path.stem == "images" and _is_pose(text) else text.split()
-            if path.stem == "cameras" and words[1] not in _CAMERA_MODELS:
+            if path.stem == "cameras" and words[1] not in _camera_models():
                 raise SourceError(f"{path}:{line}: has a camera of the unknown model {words[1][:60]}: {REMEDY}")
-            numbers = [word for word in words if word not in _SENSORS and word not in _CAMERA_MODELS]
+            numbers = [word for word in words if word not in _SENSORS and word not in _camera_models()]
             if numbers and not np.isfinite(to_floats(numbers) or np.nan).all():
                 raise _fault(path, line, text, "numbers")
 
@@ -117,7 +118,7 @@ def _cameras(walk: _Bytes) -> None:
     for _ in range(walk.count(24)):
         walk.skip(4)
         number = walk.number(_I32)
-        if number not in _CAMERA_MODELS.values():
+        if number not in _camera_models().values():
             raise walk.fault(f"has a camera of the unknown model {number}", walk.at - 4)
         walk.skip(16 + 8 * len(pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(number), 1, 1, 1).params))
 
@@ -158,8 +159,12 @@ _RECORDS: Mapping[str, Callable[[_Bytes], None]] = {
     "rigs": _rigs,
     "frames": _frames,
 }
-_CAMERA_MODELS = {name: int(one) for name, one in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
 _SENSORS = ("CAMERA", "IMU")
+
+
+@cache
+def _camera_models() -> Mapping[str, int]:
+    return {name: int(one) for name, one in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
 
 
 def _check_lines(path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import gammaln
 
 from hodge_pipeline import se3
@@ -130,6 +129,8 @@ def mixture(factor: Floats) -> tuple[Floats, float]:
     """The shares of right and wrong loops that are likeliest with these log Bayes factors (M,), half a loop of each
     counted beforehand; and the log-likelihood of the loops then, against all being wrong.
     """
+    from scipy.optimize import brentq  # which takes .1 s, and not every graph needs it
+
     gain = np.expm1(np.minimum(factor, LARGEST))
 
     def slope(right: float) -> float:  # of the log-likelihood, which is concave
