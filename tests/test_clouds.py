@@ -267,6 +267,16 @@ def test_a_scan_of_many_points_is_said_to_be_down_sampled(monkeypatch: pytest.Mo
     assert str(counts.odd) == f"frame 7: down-sampled in parts: 2000 points to {counts.points}, one a voxel of 0.5 m"
 
 
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_an_even_image_is_blank_whatever_surrounds_it(level: int) -> None:
+    image = np.full((120, 160, 3), level, np.uint8)
+    image[::7, ::9] -= level > 0  # a sensor's noise
+    image[:, :6] = 0  # beside a bent lens' image that was made straight
+    assert clouds_module.is_blank(image) and clouds_module.is_blank(image[:, :, 0])
+    image[40:60, 40:60] = 60
+    assert not clouds_module.is_blank(image) and not clouds_module.is_blank(image[:, :, 0])
+
+
 def test_clouds_on_disk_give_their_memory_back(tmp_path: Path) -> None:
     points = np.random.default_rng(0).normal(size=(1_000_000, 3)).astype(np.float32)
     CloudSet.from_clouds([PointCloud(part) for part in np.split(points, 1000)]).save(tmp_path)

@@ -204,6 +204,7 @@ def test_colour_that_is_absent_or_too_late(folder: Path) -> None:
         "3 of 3 depth images have no colour image within 0.005 s, the nearest is 0.01 s away: set max_difference_s, or "
         "are they of two clocks?"
     ) in source.notes
+    assert any("colour images have no depth image within 0.005 s" in note for note in source.notes)
     (folder / "rgb.txt").unlink()
     (folder / "rgb").rename(folder / "elsewhere")
     assert "no rgb.txt: frames have no colour" in TumReader().open(folder).notes

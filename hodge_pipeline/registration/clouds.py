@@ -32,6 +32,8 @@ BLANK_LEVELS = 6
 """Of 255, by which nearly all pixels of a blank image differ at most: a covered camera's do by 5 where its noise is 2
 levels. Images of fr1/rpy, fr1/xyz, red kitchen, ICL-NUIM and rendered rooms span 113 and more, 11 at a tenth of their
 brightness."""
+FEW_PIXELS = 0.02
+"""Of an image's: the brightest and the darkest that do not count. The rim of a lens' image is a hundredth."""
 BLANK_STRIDE = 4
 """Pixels between two that are looked at for it."""
 BLANK = "its depth is sound, but its colour image shows nothing: black, or of one even colour"
@@ -207,10 +209,14 @@ def _no_returns(every: Sequence[CloudCounts]) -> tuple[str, ...]:
 
 
 def is_blank(image: Bytes) -> bool:
-    """Whether an image, (H, W) or (H, W, 3), shows nothing: black, or of one even colour, a few pixels aside."""
+    """Whether an image, (H, W) or (H, W, 3), shows nothing: black, or of one even colour, a few pixels aside, and zeros
+    that are fewer than half: they surround the image of a lens that was made straight.
+    """
     pixels = image[::BLANK_STRIDE, ::BLANK_STRIDE]
     for levels in pixels.reshape(pixels.shape[0] * pixels.shape[1], -1).T:
-        darkest, brightest = np.searchsorted(np.bincount(levels).cumsum(), (0.01 * len(levels), 0.99 * len(levels)))
+        below = np.bincount(levels).cumsum()
+        below -= below[0] if 2 * below[0] < below[-1] else 0
+        darkest, brightest = np.searchsorted(below, (FEW_PIXELS * below[-1], (1 - FEW_PIXELS) * below[-1]))
         if brightest - darkest > BLANK_LEVELS:
             return False
     return True

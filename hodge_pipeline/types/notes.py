@@ -59,8 +59,12 @@ DOUBTS = {
 """What puts the result in doubt."""
 LOOKS = {
     "option unknown": "{detail}; made by another version: it is left out of what is shown",
-    "tracking lost": "tracking was lost at {count} {count:frame|frames} ({detail}): {count:its pose lies between "
-    "its|their poses lie between their} neighbours'",
+    "tracking lost": "tracking was lost at {count} {count:frame|frames} ({detail}): {count:its pose is|their poses "
+    "are} guessed from {count:its|their} neighbours'",
+    "no colour": "{count} of {detail} frames with depth {count:has|have} no colour image: surfaces alone place "
+    "{count:it|them}",
+    "no pose near": "the trajectory beside the {count} {count:frame|frames} has no pose near in time of any: is it of "
+    "another clock?",
     "blank images": "{count} {count:frame has|frames have} depth, but a colour image that shows nothing, black or of "
     "one even colour ({detail}): surfaces alone place them",
     "moving objects": "much of {count} {count:frame|frames} moved otherwise than the camera ({detail}): people or "

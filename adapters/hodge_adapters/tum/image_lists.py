@@ -131,6 +131,9 @@ def _from_lists(folder: Path, max_difference_s: float, notes: list[str]) -> Stam
     if alone == len(depth) and colour:
         nearest_s = np.abs(colour_stamps_s - depth_stamps_s[alone // 2]).min()
         notes[-1] += f", the nearest is {nearest_s:.3g} s away: set max_difference_s, or are they of two clocks?"
+    unpaired = len(colour) - len(np.unique(columns[columns >= 0]))
+    if unpaired:
+        notes.append(f"{unpaired} of {len(colour)} colour images have no depth image within {max_difference_s:g} s")
     paired = [colour[column] if column >= 0 else None for column in columns.tolist()]
     delays_s = np.where(columns >= 0, np.append(colour_stamps_s, 0.0)[columns] - depth_stamps_s, 0.0)
     return StampedImages(depth_stamps_s, depth, paired, delays_s, lists, runs)

@@ -107,7 +107,7 @@ def _better(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]
         same = judge(tried, scales=found.scales)  # so that nothing but the step differs
         if same is None or same.log_evidence <= found.log_evidence + least:
             continue
-        if broken.usual or chain.corridors_over(broken.at, np.flatnonzero(same.used)) > 1:
+        if broken.usual or same.start.chain.corridors_over(broken.at, np.flatnonzero(same.used)) > 1:
             return tried, judge(tried) or same
     return None
 
