@@ -128,6 +128,16 @@ class KeyFrames:
             after[rows] = _filled(after[rows], self.found[rows], self.stamps_s[rows])
         return np.asarray(after)
 
+    def of_frames(self, of_key: Ints) -> Ints:
+        """What holds for each key frame (K,), as its component, for each of the frames (N,) that follow it; one that
+        was not found follows what the frames follow between which it is posed.
+        """
+        out = of_key[self.key_of_frame]
+        for name in np.unique(self.sequence):
+            rows = np.flatnonzero(self.sequence == name)
+            out[rows] = out[rows[_nearest_found(self.found[rows])[0]]]
+        return out
+
 
 @dataclass(frozen=True)
 class Drift:
@@ -258,17 +268,23 @@ def own_trajectory(source: Source) -> Trajectory | None:
 
 def _filled(poses: Floats, found: Bools, times: Floats) -> Floats:
     """The poses, those not found taken between the nearest found ones, or from the nearest at an end."""
-    known = np.flatnonzero(found)
-    if found.all() or not len(known):
-        return poses
     missing = np.flatnonzero(~found)
-    after = np.clip(np.searchsorted(known, missing), 0, len(known) - 1)
-    before = np.clip(np.searchsorted(known, missing) - 1, 0, len(known) - 1)
-    a, b = known[before], known[after]
+    if not len(missing) or not found.any():
+        return poses
+    a, b = _nearest_found(found)[:, missing]
     share = np.clip((times[missing] - times[a]) / np.where(b > a, times[b] - times[a], 1.0), 0.0, 1.0)
     out = poses.copy()
     out[missing] = se3.interpolate(poses[a], poses[b], share)
     return np.asarray(out)
+
+
+def _nearest_found(found: Bools) -> Ints:
+    """The last found place up to each and the first from it on (2, N); the nearest twice at an end."""
+    every, known = np.arange(len(found)), np.flatnonzero(found)
+    if not len(known):
+        return np.stack([every, every])
+    before = known[np.maximum(np.searchsorted(known, every, side="right") - 1, 0)]
+    return np.stack([before, known[np.minimum(np.searchsorted(known, every), len(known) - 1)]])
 
 
 def pose_sets(rounds: Sequence[Round], source: Source) -> dict[str, Floats]:

@@ -132,6 +132,17 @@ def test_a_refinement_that_is_not_kept_is_not_called_the_result(report: Report) 
     assert next(worst_places(replace(shown, shows_rejected=False))).startswith("Frame ")
 
 
+def test_the_worst_frame_is_the_one_of_the_largest_error_of_all_frames(report: Report) -> None:
+    truth = np.tile(np.eye(4), (6, 1, 1))
+    truth[:, 0, 3] = np.arange(6)
+    poses = truth.copy()
+    poses[4, 1, 3] = 0.3
+    (row,) = trajectory_rows({"result": poses}, truth, names=[f"f{number}" for number in range(6)])
+    assert row.worst == "f4"
+    places = worst_places(replace(report, trajectories=(row,)))
+    assert next(places) == f"Frame f4 lies {report.length(row.ate_max_m)} off the truth, more than any other."
+
+
 def test_a_length_has_no_unit_where_none_is_known(report: Report) -> None:
     page = document(replace(report, has_metres=False), "runs/a")
     assert page.first[0].lines[0].endswith("it is 0.5 and 0.2° off the result.") or "0.50" in page.first[0].lines[0]

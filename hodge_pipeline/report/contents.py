@@ -65,7 +65,8 @@ class SourceSummary:
 class TrajectoryRow:
     """Absolute (ATE) and relative (RPE, over `rpe_delta_frames`) error of one set of poses against the truth.
 
-    `of` says what is counted in `frames` and `left_out`: the frames of the source, or the poses of a file.
+    `of` says what is counted in `frames` and `left_out`: the frames of the source, or the poses of a file; `worst` is
+    the name of the frame with the largest error, where frames have names.
     """
 
     name: str
@@ -79,6 +80,7 @@ class TrajectoryRow:
     degenerate: bool = False
     rpe_delta_frames: int = 1
     of: str = "frames"
+    worst: str = ""
 
 
 @dataclass(frozen=True)

@@ -184,8 +184,10 @@ def _trajectories(
         every[START] = given_poses(scene.whole)
     sequences = [frame.sequence for frame in scene.whole.frames]
     delta_frames = recipe.evaluation.rpe_delta_frames
-    component = component[scene.key_frames.key_of_frame]
-    return trajectory_rows(every, true_poses(scene.whole), component, sequences, delta_frames=delta_frames)
+    component = scene.key_frames.of_frames(component)
+    names = [frame.frame_id for frame in scene.whole.frames]
+    truth = true_poses(scene.whole)
+    return trajectory_rows(every, truth, component, sequences, names=names, delta_frames=delta_frames)
 
 
 def _of_file(

@@ -36,9 +36,11 @@ def trajectory_rows(
     component: Ints | None = None,
     sequence: Sequence[str] | None = None,
     *,
+    names: Sequence[object] = (),
     delta_frames: int = 1,
 ) -> tuple[TrajectoryRow, ...]:
-    """The errors of each named set of poses (N, 4, 4) against the truth (N, 4, 4), NaN where a frame has none.
+    """The errors of each named set of poses (N, 4, 4) against the truth (N, 4, 4), NaN where a frame has none; frames
+    may have `names (N,)`.
 
     Each component (N,) is aligned apart; a frame that is one by itself is left out, since it would fit its truth
     exactly. Relative motions, over `delta_frames`, also stop at the end of a sequence.
@@ -52,12 +54,16 @@ def trajectory_rows(
             name,
             absolute_error(poses, truth, component),
             relative_error(poses, truth, delta_frames, component=parts),
+            names,
         )
         for name, poses in pose_sets.items()
     )
 
 
-def _trajectory_row(name: str, absolute: AbsoluteError, relative: RelativeError) -> TrajectoryRow:
+def _trajectory_row(
+    name: str, absolute: AbsoluteError, relative: RelativeError, names: Sequence[object]
+) -> TrajectoryRow:
+    worst = int(np.nanargmax(absolute.per_frame_m)) if absolute.frames and len(names) else -1
     return TrajectoryRow(
         name=name,
         frames=absolute.frames,
@@ -68,6 +74,7 @@ def _trajectory_row(name: str, absolute: AbsoluteError, relative: RelativeError)
         rpe_translation_m=relative.translation_rmse_m,
         rpe_rotation_deg=relative.rotation_rmse_deg,
         rpe_delta_frames=relative.delta_frames,
+        worst=str(names[worst]) if worst >= 0 else "",
         degenerate=any(alignment.degenerate for alignment in absolute.alignments),
     )
 

@@ -22,7 +22,10 @@ def peak(report: Report) -> str:
 def worst_places(report: Report) -> Iterator[str]:
     """The frame and the edge that are worst, a line each, where they were measured."""
     errors = offsets(report).get(report.after)
-    if errors is not None and len(report.pictures.names) == len(errors):
+    of_all = next((row for row in report.trajectories if row.name == report.after and row.worst), None)
+    if of_all is not None and not report.shows_rejected:
+        yield f"Frame {of_all.worst} lies {report.length(of_all.ate_max_m)} off the truth, more than any other."
+    elif errors is not None and len(report.pictures.names) == len(errors):
         size = np.linalg.norm(errors, axis=1)
         row = int(np.nanargmax(size))
         name, off = f"{report.source.vertex} {report.pictures.names[row]}", report.length(float(size[row]))

@@ -1,0 +1,39 @@
+"""How frames follow key frames: those that were not found lie where their neighbours do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hodge_pipeline.scene import KeyFrames
+
+
+def followed(found: list[bool]) -> KeyFrames:
+    """Six frames a metre apart, each second of which is a key frame; those that are not found hang on a wrong pose."""
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, 0, 3] = np.where(found, np.arange(6), 99.0)
+    key, rows = np.array([0, 0, 1, 1, 2, 2]), np.array([0, 2, 4])
+    part, zeros, times = np.array([0, 0, 1, 1, 2, 2]), np.zeros(6, np.int64), np.arange(6.0)
+    return KeyFrames(rows, poses, poses[rows], part, times, np.array(found), times, zeros, key)
+
+
+@pytest.mark.parametrize(
+    ("found", "x", "of"),
+    [
+        ([True] * 6, [0, 1, 2, 3, 4, 5], [7, 7, 8, 8, 9, 9]),
+        ([False, False, True, True, True, True], [2, 2, 2, 3, 4, 5], [8, 8, 8, 8, 9, 9]),
+        ([True, True, False, False, True, True], [0, 1, 2, 3, 4, 5], [7, 7, 7, 7, 9, 9]),
+        ([True, True, True, True, False, False], [0, 1, 2, 3, 3, 3], [7, 7, 8, 8, 8, 8]),
+    ],
+)
+def test_frames_that_were_not_found_follow_their_neighbours(found: list[bool], x: list[float], of: list[int]) -> None:
+    frames = followed(found)
+    np.testing.assert_allclose(frames.expand(frames.world_from_key)[:, 0, 3], x)
+    assert frames.of_frames(np.array([7, 8, 9])).tolist() == of
+
+
+def test_frames_none_of_which_was_found_stay_with_their_key_frames() -> None:
+    frames = replace(followed([True] * 6), found=np.zeros(6, bool))
+    assert frames.of_frames(np.array([7, 8, 9])).tolist() == [7, 7, 8, 8, 9, 9]
