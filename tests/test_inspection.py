@@ -98,7 +98,7 @@ def test_a_sound_sequence_has_no_oddities() -> None:
     ("row", "change", "expected"),
     [
         (4, {"stamp_s": 0.3}, "1 stamp is that of the one before: after 3"),
-        (4, {"stamp_s": 0.25}, "1 stamp is before the one before them"),
+        (4, {"stamp_s": 0.25}, "1 stamp is earlier than the stamp before"),
         (9, {"stamp_s": 7.0}, "1 gap in time of more than 5 steps; the longest, 6.2 s, between 8 and 9"),
         (5, {"frame_id": 4}, "1 frame ids are given more than once: 4"),
         (5, {"read_depth": None}, "1 of 10 frames have no depth: 5"),

@@ -107,7 +107,7 @@ def stamp_facts(stamps_s: Floats, together: Bools, names: Sequence[str], odditie
         oddities.append(f"{counted(len(same), 'stamp is|stamps are')} that of the one before: after {listed(same)}")
     if (steps < 0).any():
         oddities.append(
-            f"{counted(int((steps < 0).sum()), 'stamp is|stamps are')} before the one before them: not in order of time"
+            f"{counted(int((steps < 0).sum()), 'stamp is|stamps are')} earlier than the stamp before: not in order of time"
         )
     usual = float(np.median(steps)) if len(steps) else 0.0
     gaps = steps > GAP * usual
