@@ -106,9 +106,8 @@ def stamp_facts(stamps_s: Floats, together: Bools, names: Sequence[str], odditie
         same = [names[row] for row in after[steps == 0]]
         oddities.append(f"{counted(len(same), 'stamp is|stamps are')} that of the one before: after {listed(same)}")
     if (steps < 0).any():
-        oddities.append(
-            f"{counted(int((steps < 0).sum()), 'stamp is|stamps are')} earlier than the stamp before: not in order of time"
-        )
+        back = counted(int((steps < 0).sum()), "stamp is|stamps are")
+        oddities.append(f"{back} earlier than the stamp before: not in order of time")
     usual = float(np.median(steps)) if len(steps) else 0.0
     gaps = steps > GAP * usual
     if usual > 0 and gaps.any():

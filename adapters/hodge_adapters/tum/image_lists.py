@@ -129,8 +129,8 @@ def _from_lists(folder: Path, max_difference_s: float, notes: list[str]) -> Stam
     if alone:
         notes.append(f"{alone} of {len(depth)} depth images have no colour image within {max_difference_s:g} s")
     if alone == len(depth) and colour:
-        nearest_s = np.abs(colour_stamps_s - depth_stamps_s[alone // 2]).min()
-        notes[-1] += f", the nearest is {round(nearest_s, 3):g} s away: set max_difference_s, or are they of two clocks?"
+        nearest_s = round(float(np.abs(colour_stamps_s - depth_stamps_s[alone // 2]).min()), 3)
+        notes[-1] += f", the nearest is {nearest_s:g} s away: set max_difference_s, or are they of two clocks?"
     unpaired = len(colour) - len(np.unique(columns[columns >= 0]))
     if unpaired:
         notes.append(f"{unpaired} of {len(colour)} colour images have no depth image within {max_difference_s:g} s")
