@@ -17,19 +17,21 @@ LONGEST_SPAN_S = 0.5
 
 
 def velocities(world_from_cam: Floats, times_s: Floats, sequence: Ints, found: Bools) -> Floats:
-    """Twists (N, 6) a second in each camera's axes, from the frames before and after it, or from one of them.
+    """Twists (N, 6) a second in each camera's axes, from the frames before and after it, or from one of them; where one
+    of these has no pose of its own, from the next but one.
 
     Zero where a frame has no neighbour near in time with a pose of its own.
     """
     rows = np.arange(len(times_s))
 
-    def near(other: Ints) -> Bools:
-        inside = (other >= 0) & (other < len(rows))
-        at = np.clip(other, 0, len(rows) - 1)
-        return np.asarray(inside & found & found[at] & (sequence == sequence[at]))
+    def beside(sign: int) -> Ints:
+        out = rows
+        for other in (rows + 2 * sign, rows + sign):
+            at = np.clip(other, 0, len(rows) - 1)
+            out = np.where((other == at) & found & found[at] & (sequence == sequence[at]), at, out)
+        return out
 
-    before = np.where(near(rows - 1), rows - 1, rows)
-    after = np.where(near(rows + 1), rows + 1, rows)
+    before, after = beside(-1), beside(1)
     span = times_s[after] - times_s[before]
     known = (span > 0) & (span <= LONGEST_SPAN_S)
     twists = se3.log(se3.inverse(world_from_cam[before]) @ world_from_cam[after])

@@ -18,6 +18,7 @@ from hodge_pipeline.registration.clouds import CloudOptions, no_clouds
 from hodge_pipeline.registration.gaps import told_gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chained
 from hodge_pipeline.registration.readout import estimate_readout, with_readout
+from hodge_pipeline.registration.repeats import find_repeats
 from hodge_pipeline.registration.shutter import at_frame_stamp, velocities
 from hodge_pipeline.registration.smoothing import VIDEO_STEP_S
 from hodge_pipeline.registration.tracked_blocks import BlockRows, TrackedBlocks
@@ -149,9 +150,11 @@ def followers(source: Source, tracked: Tracked) -> KeyFrames:
 
 
 def track(source: Source, options: TrackingOptions, *, workers: Workers, step: Step) -> Tracked:
-    """Step: the source tracked, block by block; a killed run goes on with the next block."""
-    folder = step.folder
-    stamps, sequences = stamps_of(source), list(sequences_of(source).values())
+    """Step: the source tracked, block by block, without frames that repeat the one before; a killed run goes on with
+    the next block.
+    """
+    folder, repeats = step.folder, find_repeats(source.frames)
+    stamps, sequences = stamps_of(source), [np.setdiff1d(rows, repeats) for rows in sequences_of(source).values()]
     cut = [block for rows in sequences for block in frame_blocks(rows, tuple(source.frames), stamps)]
     blocks = TrackedBlocks(folder / "blocks")
     _track_missing(blocks, cut, options, workers, step.advance)
@@ -178,12 +181,12 @@ def track(source: Source, options: TrackingOptions, *, workers: Workers, step: S
         piece=connected_components(held.pairs, len(key_rows)),
         steps=held,
         apart=np.unique(np.concatenate([part.apart for part in parts])),
-        **_anchored(parts, cut, key_of_row),
+        **_anchored(parts, cut, key_of_row, repeats),
     )
     tracked = _without_lonely(tracked)
     first = tracked.world_from_key[tracked.anchors] @ tracked.key_from_frame
     twists = velocities(first, stamps_of(source), sequence_numbers(source), tracked.found)
-    notes = _notes(source, tracked, parts)
+    notes = _notes(source, tracked, parts, repeats)
     readout = estimate_readout(sightings, source.frames, first, twists, options.clouds.unit_m)
     if readout is not None:
         tracked = replace(tracked, readout_s=readout.best_s)
@@ -211,18 +214,24 @@ def _renumbered(rows: Ints, key_of_row: dict[int, int]) -> Ints:
     return np.array([key_of_row[row] for row in rows.ravel().tolist()], np.int64).reshape(rows.shape)
 
 
-def _anchored(parts: list[BlockRows], cut: list[FrameBlock], key_of_row: dict[int, int]) -> dict[str, Any]:
-    """Key frame, relative motion and success of each frame; a row that two blocks share belongs to the earlier one."""
+def _anchored(
+    parts: list[BlockRows], cut: list[FrameBlock], key_of_row: dict[int, int], repeats: Ints
+) -> dict[str, Any]:
+    """Key frame, relative motion and success of each frame; a row that two blocks share belongs to the earlier one, and
+    frames that repeat another, which were not tracked, follow its key frame.
+    """
     fresh = [slice(int(block.warm_up), None) for block in cut]
     rows = np.concatenate([part.rows[keep] for part, keep in zip(parts, fresh, strict=True)])
     anchors = np.concatenate([part.anchors[keep] for part, keep in zip(parts, fresh, strict=True)])
     motions = np.concatenate([part.key_from_row[keep] for part, keep in zip(parts, fresh, strict=True)])
     fitness = np.concatenate([part.fitness[keep] for part, keep in zip(parts, fresh, strict=True)])
     order = np.argsort(rows)
+    every = np.arange(len(rows) + len(repeats))
+    order = order[np.searchsorted(rows[order], every, side="right") - 1]
     return {
         "anchors": _renumbered(anchors[order], key_of_row),
         "key_from_frame": motions[order],
-        "found": np.isfinite(fitness[order]),
+        "found": np.isfinite(fitness[order]) & ~np.isin(every, repeats),
     }
 
 
@@ -246,14 +255,16 @@ def _move_landmarks(source: Source, tracked: Tracked, twists: Floats) -> None:
     points.flush()
 
 
-def _notes(source: Source, tracked: Tracked, parts: list[BlockRows]) -> tuple[Note, ...]:
+def _notes(source: Source, tracked: Tracked, parts: list[BlockRows], repeats: Ints) -> tuple[Note, ...]:
     notes = [Note("key frames", len(tracked.key_rows), str(len(tracked.anchors)))]
-    lost = np.flatnonzero(~tracked.found)
+    lost = np.setdiff1d(np.flatnonzero(~tracked.found), repeats)
     ids = vertex_ids(source)
     back = [row for rows in sequences_of(source).values() for row in _where_the_clock_goes_back(source, rows)]
     if back:
         notes.append(Note("clock", len(back), in_runs(np.array(back), ids)))
     notes += told_gaps(list(sequences_of(source).values()), stamps_of(source), ids)
+    if len(repeats):
+        notes.append(Note("repeated images", len(repeats), in_runs(repeats, ids)))
     if len(lost):
         notes.append(Note("tracking lost", len(lost), in_runs(lost, ids)))
     blank = np.unique(np.concatenate([part.blank for part in parts]))

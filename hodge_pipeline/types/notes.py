@@ -65,6 +65,8 @@ LOOKS = {
     "{count:it|them}",
     "no pose near": "the trajectory beside the {count} {count:frame|frames} has no pose near in time of any: is it of "
     "another clock?",
+    "repeated images": "{count} {count:frame repeats|frames repeat} the images of the frame before ({detail}), as "
+    "where a camera stalls: {count:its pose is|their poses are} guessed from {count:its|their} neighbours'",
     "blank images": "{count} {count:frame has|frames have} depth, but a colour image that shows nothing, black or of "
     "one even colour ({detail}): surfaces alone place them",
     "moving objects": "much of {count} {count:frame|frames} moved otherwise than the camera ({detail}): people or "
