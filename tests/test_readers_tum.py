@@ -327,14 +327,17 @@ def test_a_renamed_folder_is_known_by_its_stamps(name: str, data_dir: Path, tmp_
     assert any("intrinsics of fr1 taken: by the day of the stamps" in note for note in source.notes)
 
 
-def test_two_cameras_that_images_do_not_tell_apart_are_both_named(
-    data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", ["fr1_rpy_part", "rgbd_dataset_freiburg1_xyz_60"])
+def test_two_cameras_that_images_do_not_tell_apart_are_a_doubt_that_names_both(
+    name: str, data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reader, "RECORDED_ON", dict.fromkeys(reader.RECORDED_ON, set()))
-    folder = linked(data_dir / "tum" / "fr1_rpy_part", tmp_path)
-    (note,) = (note for note in TumReader().open(folder).notes if "tried on the images" in note)
+    source = TumReader().open(linked(data_dir / "tum" / name, tmp_path))
+    (note,) = (note for note in source.notes if "tried on the images" in note)
     taken, other = ("fr1", "fr2") if "of fr1 taken" in note else ("fr2", "fr1")
-    assert f"of {taken} taken" in note and f"set camera={other} if it was that" in note
+    (doubt,) = map(str, source.doubts)
+    assert f"of {taken} taken" in note
+    assert doubt.startswith(f"the camera may be {other} in place of {taken}: set source.reader.camera={other} if")
 
 
 @pytest.mark.parametrize("listed", ["lists", "association"])
