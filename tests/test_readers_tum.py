@@ -15,6 +15,7 @@ from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guess_reader
+from hodge_pipeline.start.key_frames import is_video
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera, Source, Trajectory
 from readers_data import HEIGHT, WIDTH, agreement, depth_values, linked, some_poses, tum_folder, tum_line, write_depth
@@ -318,6 +319,22 @@ def test_frame_numbers_for_stamps(data_dir: Path) -> None:
     assert [frame.frame_id for frame in source.frames] == list(range(58))
     assert source.frames[0].camera == Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
     np.testing.assert_allclose(source.frames[1].world_from_cam[:3, 3], [-2.4691, 1.0757, 1.0996])
+
+
+def test_lists_of_numbers_take_the_stamps_in_the_names_of_the_images(tmp_path: Path) -> None:
+    folder = tum_folder(tmp_path / "sequence", tuple(10 + row / 15 for row in range(6)))
+    stamped = TumReader().open(folder)
+    for name in ("depth.txt", "rgb.txt"):
+        files = [line.split()[1] for line in (folder / name).read_text().splitlines() if line[0] != "#"]
+        (folder / name).write_text("".join(f"{row} {file}\n" for row, file in enumerate(files)))
+    source = TumReader().open(folder)
+    assert [frame.stamp_s for frame in source.frames] == [frame.stamp_s for frame in stamped.frames]
+    assert [frame.colour_delay_s for frame in source.frames] == [frame.colour_delay_s for frame in stamped.frames]
+    assert is_video(source)
+    assert all(
+        f"{name}.txt: it holds numbers, so stamps are those in the images' names" in source.notes
+        for name in ("depth", "rgb")
+    )
 
 
 @pytest.mark.parametrize("name", ["fr1_rpy_part", "rgbd_dataset_freiburg1_xyz_60"])

@@ -196,6 +196,19 @@ def test_what_is_short_enough_is_registered_whole_unless_it_is_a_video(
     assert len(scene.first.world_from_cam) == len(scene.clouds)
 
 
+@pytest.mark.parametrize(("up_to", "is_said"), [("auto", True), ("12", False)])
+def test_numbered_frames_that_are_not_tracked_are_said(
+    sequence: Path, tmp_path: Path, up_to: str, is_said: bool
+) -> None:
+    recipe = small_recipe(sequence, f"start.whole_up_to={up_to}")
+    steps, reader = Store(tmp_path), TumReader()
+    opened = reader.open(sequence)
+    frames = tuple(replace(frame, stamp_s=float(row)) for row, frame in enumerate(opened.frames[:12]))
+    source = remembered(replace(opened, frames=frames), reader, steps, fingerprints(opened.files))
+    recipe.start.begin(source, recipe.clouds, steps, InProcess())
+    assert any("12 frames are numbered, and nothing tells" in str(note) for note in steps.notes) == is_said
+
+
 def test_frames_follow_their_key_frames(sequence: Path, whole: Tracked) -> None:
     source, found = TumReader().open(sequence), whole
     before = all_poses(source, found, found.world_from_key)
