@@ -12,11 +12,13 @@ import pytest
 from hodge_adapters.icl_nuim.reader import IclNuimReader
 from hodge_adapters.images import fitted_camera
 from hodge_adapters.images.camera_files import Intrinsics
+from hodge_adapters.images.fitted_camera import Fit
 from hodge_adapters.tum import reader
 from hodge_adapters.tum.reader import CAMERAS, TumReader
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import inspect
+from hodge_pipeline.types.notes import Rank
 from readers_data import linked
 
 FOCAL_PX, FRAMES = 525.0, 14
@@ -90,10 +92,26 @@ def test_errors_count_in_each_camera_s_own_pixels(office: Path) -> None:
     assert found == {}
 
 
+def test_a_camera_counts_as_told_only_if_it_fits_better_in_nearly_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mean that is surely better may be so by what all pairs share."""
+    errors = np.tile([0.0, -0.5, -0.52, -0.3], (20, 1))  # standard, rival, best, worse
+    errors[:5, 1] = -0.53
+    monkeypatch.setattr(fitted_camera, "_errors", lambda *_: errors)
+    cameras = dict.fromkeys(("standard", "rival", "best", "worse"), Intrinsics(525.0, 525.0, 319.5, 239.5, (640, 480)))
+    found = fitted_camera.fitting(cameras, "standard", (), (), np.zeros(0), 5000.0)
+    assert {name: fit.beaten for name, fit in found.items()} == {"best": 0.0, "rival": 0.75, "worse": 1.0}
+    (doubt,) = fitted_camera.untold_camera_doubts(found)
+    assert doubt.rank is Rank.INPUT and str(doubt) == (
+        "the camera may be rival in place of best: set source.reader.camera=rival if it was; best fits better in "
+        "only 75 % of the pairs of frames"
+    )
+    assert fitted_camera.untold_camera_doubts({"best": Fit(0.4), "worse": Fit(0.3, 1.0)}) == ()
+
+
 def test_the_day_of_the_stamps_counts_more_than_the_images(
     data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reader, "fitting", lambda *_: {"fr2": 0.02, "fr3": 0.02})
+    monkeypatch.setattr(reader, "fitting", lambda *_: {"fr2": Fit(0.02), "fr3": Fit(0.02, 0.5)})
     source = TumReader().open(linked(data_dir / "tum/fr1_rpy_part", tmp_path))
     assert source.frames[0].camera.fx == CAMERAS["fr1"].fx
     assert "intrinsics of fr1 taken: by the day of the stamps, 2011-05-10" in source.notes

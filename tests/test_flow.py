@@ -128,6 +128,9 @@ def test_velocities_come_from_the_frames_around_and_not_from_over_a_gap() -> Non
     np.testing.assert_allclose(speeds[[0, 1]], [twist, twist], atol=1e-12)
     np.testing.assert_array_equal(speeds[[2, 3, 5]], np.zeros((3, 6)))  # over the gap, or without a pose
     np.testing.assert_array_equal(velocities(poses, times, np.arange(6), found), np.zeros((6, 6)))
+    found[1] = False
+    speed = velocities(poses, times, np.zeros(6, np.int64), found)[0]
+    np.testing.assert_allclose(speed, twist, atol=1e-12)  # from the next but one
 
 
 def rolling_block(readout_s: float) -> tuple[Sightings, PosedBlock, Floats]:

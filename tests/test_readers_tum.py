@@ -15,6 +15,7 @@ from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guess_reader
+from hodge_pipeline.start.key_frames import is_video
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera, Source, Trajectory
 from readers_data import HEIGHT, WIDTH, agreement, depth_values, linked, some_poses, tum_folder, tum_line, write_depth
@@ -321,6 +322,22 @@ def test_frame_numbers_for_stamps(data_dir: Path) -> None:
     np.testing.assert_allclose(source.frames[1].world_from_cam[:3, 3], [-2.4691, 1.0757, 1.0996])
 
 
+def test_lists_of_numbers_take_the_stamps_in_the_names_of_the_images(tmp_path: Path) -> None:
+    folder = tum_folder(tmp_path / "sequence", tuple(10 + row / 15 for row in range(6)))
+    stamped = TumReader().open(folder)
+    for name in ("depth.txt", "rgb.txt"):
+        files = [line.split()[1] for line in (folder / name).read_text().splitlines() if line[0] != "#"]
+        (folder / name).write_text("".join(f"{row} {file}\n" for row, file in enumerate(files)))
+    source = TumReader().open(folder)
+    assert [frame.stamp_s for frame in source.frames] == [frame.stamp_s for frame in stamped.frames]
+    assert [frame.colour_delay_s for frame in source.frames] == [frame.colour_delay_s for frame in stamped.frames]
+    assert is_video(source)
+    assert all(
+        f"{name}.txt: it holds numbers, so stamps are those in the images' names" in source.notes
+        for name in ("depth", "rgb")
+    )
+
+
 @pytest.mark.parametrize("name", ["fr1_rpy_part", "rgbd_dataset_freiburg1_xyz_60"])
 def test_a_renamed_folder_is_known_by_its_stamps(name: str, data_dir: Path, tmp_path: Path) -> None:
     source = TumReader().open(linked(data_dir / "tum" / name, tmp_path))
@@ -328,14 +345,17 @@ def test_a_renamed_folder_is_known_by_its_stamps(name: str, data_dir: Path, tmp_
     assert any("intrinsics of fr1 taken: by the day of the stamps" in note for note in source.notes)
 
 
-def test_two_cameras_that_images_do_not_tell_apart_are_both_named(
-    data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", ["fr1_rpy_part", "rgbd_dataset_freiburg1_xyz_60"])
+def test_two_cameras_that_images_do_not_tell_apart_are_a_doubt_that_names_both(
+    name: str, data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reader, "RECORDED_ON", dict.fromkeys(reader.RECORDED_ON, set()))
-    folder = linked(data_dir / "tum" / "fr1_rpy_part", tmp_path)
-    (note,) = (note for note in TumReader().open(folder).notes if "tried on the images" in note)
+    source = TumReader().open(linked(data_dir / "tum" / name, tmp_path))
+    (note,) = (note for note in source.notes if "tried on the images" in note)
     taken, other = ("fr1", "fr2") if "of fr1 taken" in note else ("fr2", "fr1")
-    assert f"of {taken} taken" in note and f"set camera={other} if it was that" in note
+    (doubt,) = map(str, source.doubts)
+    assert f"of {taken} taken" in note
+    assert doubt.startswith(f"the camera may be {other} in place of {taken}: set source.reader.camera={other} if")
 
 
 @pytest.mark.parametrize("listed", ["lists", "association"])

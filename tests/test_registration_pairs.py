@@ -14,7 +14,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.executors.local import InProcess, LocalExecutor
 from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
-from hodge_pipeline.registration.gaps import gaps, over_gap
+from hodge_pipeline.registration.gaps import gaps, over_gap, told_gaps
 from hodge_pipeline.registration.gicp import Gicp, Vgicp
 from hodge_pipeline.registration.odometry import OdometryOptions, odometry
 from hodge_pipeline.registration.pairs import Acceptance, register_pairs
@@ -258,6 +258,15 @@ def test_a_hole_is_a_step_much_longer_than_the_others_of_its_sequence() -> None:
     assert not len(gaps(rows, stamps[::-1]))  # no clock
     assert not len(gaps([], stamps))
     assert not len(gaps([np.arange(6)], np.array([0, 0.001, 0.002, 0.018, 0.019, 0.02]))), "a video's step is no hole"
+
+
+@pytest.mark.parametrize(
+    ("first_s", "step_s", "length"), [(0.0, 1.0, "15 frames"), (0.0, 3.0, "15 frames"), (0.5, 0.1, "1.6 s")]
+)
+def test_a_hole_in_numbers_of_frames_is_told_in_frames(first_s: float, step_s: float, length: str) -> None:
+    numbers = np.concatenate([np.arange(40), np.arange(55, 100)])
+    (note,) = told_gaps([np.arange(85)], first_s + step_s * numbers, numbers)
+    assert str(note).startswith(f"the recording stops for {length} before 55: ")
 
 
 def test_sequences_are_not_joined_and_stand_apart(folder: Path) -> None:

@@ -196,6 +196,19 @@ def test_what_is_short_enough_is_registered_whole_unless_it_is_a_video(
     assert len(scene.first.world_from_cam) == len(scene.clouds)
 
 
+@pytest.mark.parametrize(("up_to", "is_said"), [("auto", True), ("12", False)])
+def test_numbered_frames_that_are_not_tracked_are_said(
+    sequence: Path, tmp_path: Path, up_to: str, is_said: bool
+) -> None:
+    recipe = small_recipe(sequence, f"start.whole_up_to={up_to}")
+    steps, reader = Store(tmp_path), TumReader()
+    opened = reader.open(sequence)
+    frames = tuple(replace(frame, stamp_s=float(row)) for row, frame in enumerate(opened.frames[:12]))
+    source = remembered(replace(opened, frames=frames), reader, steps, fingerprints(opened.files))
+    recipe.start.begin(source, recipe.clouds, steps, InProcess())
+    assert any("12 frames are numbered, and nothing tells" in str(note) for note in steps.notes) == is_said
+
+
 def test_frames_follow_their_key_frames(sequence: Path, whole: Tracked) -> None:
     source, found = TumReader().open(sequence), whole
     before = all_poses(source, found, found.world_from_key)
@@ -213,6 +226,31 @@ def test_blocks_share_their_border_and_nothing_else() -> None:
     assert [int(part[0]) for part in own[1:]] == [int(part[-1]) for part in own[:-1]]
     np.testing.assert_array_equal(np.concatenate([own[0], *(part[1:] for part in own[1:])]), rows)
     assert [block.rows.tolist() for block in frame_blocks(np.array([3]), tuple(range(9)), np.arange(9.0))] == [[3]]  # type: ignore[arg-type]
+
+
+def test_frames_that_repeat_the_images_before_are_said_and_posed_by_their_neighbours(
+    sequence: Path, tmp_path: Path
+) -> None:
+    source = TumReader().open(sequence)
+    repeats = [*range(40, 44), 55]
+    frames = list(source.frames)
+    for row in repeats:
+        shown = frames[row - 1]
+        frames[row] = replace(
+            frames[row], read_depth=shown.read_depth, read_colour=shown.read_colour, image=shown.image
+        )
+    stalled = replace(source, frames=tuple(frames))
+    found, notes = track(stalled, tmp_path / "stalled")
+    (said,) = [note for note in notes if "repeat the images" in note]
+    assert said.startswith("5 frames repeat the images of the frame before (40–43, 55)")
+    assert np.flatnonzero(~found.found).tolist() == repeats and not np.isin(found.key_rows, repeats).any()
+    poses = all_poses(stalled, found, found.world_from_key)
+    stamps = [frame.stamp_s for frame in frames]
+    share = (stamps[55] - stamps[54]) / (stamps[56] - stamps[54])
+    np.testing.assert_allclose(poses[55], se3.interpolate(poses[54], poses[56], np.array(share)), atol=1e-9)
+    kept = np.setdiff1d(np.arange(len(frames)), repeats)
+    alone, _ = track(replace(source, frames=tuple(source.frames[row] for row in kept)), tmp_path / "alone")
+    np.testing.assert_array_equal(found.key_from_frame[kept], alone.key_from_frame)
 
 
 @pytest.mark.parametrize("blank", [range(0, 3), range(46, 51)])

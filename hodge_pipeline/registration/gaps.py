@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_pipeline.scene import is_clock
 from hodge_pipeline.types import Bools, Floats, Ints
 from hodge_pipeline.types.notes import Note
 
@@ -36,10 +37,20 @@ def over_gap(pairs: Ints, sequences: Sequence[Ints], stamps_s: Floats) -> Bools:
 
 
 def told_gaps(sequences: Sequence[Ints], stamps_s: Floats, ids: NDArray[np.generic]) -> tuple[Note, ...]:
-    """A note of the holes in the sequences of frames with these ids (N,), the first ones by the frame behind them."""
+    """A note of the holes in the sequences of frames with these ids (N,), the first ones by the frame behind them: how
+    long they last by a clock, or how many frames they leave out where stamps are numbers of frames.
+    """
     holes = gaps(sequences, stamps_s)
-    told = [f"{stamps_s[j] - stamps_s[i]:.1f} s before {ids[j]}" for i, j in holes[:GAPS_TOLD].tolist()]
-    return (Note("holes", len(holes), ", ".join(told) + ", …" * (len(holes) > GAPS_TOLD)),) if told else ()
+    if not len(holes):
+        return ()
+    steps = stamps_s[holes[:, 1]] - stamps_s[holes[:, 0]]
+    if is_clock(stamps_s[np.concatenate(sequences)]):
+        lengths = [f"{step_s:.1f} s" for step_s in steps.tolist()]
+    else:
+        usual = float(np.median(np.concatenate([np.diff(stamps_s[rows]) for rows in sequences])))
+        lengths = [f"{step / usual - 1:.0f} frames" for step in steps.tolist()]
+    told = [f"{length} before {ids[j]}" for length, j in zip(lengths, holes[:, 1].tolist(), strict=True)]
+    return (Note("holes", len(holes), ", ".join(told[:GAPS_TOLD]) + ", …" * (len(holes) > GAPS_TOLD)),)
 
 
 def gaps(sequences: Sequence[Ints], stamps_s: Floats) -> Ints:

@@ -21,8 +21,11 @@ def _are_same(one: Frame, other: Frame) -> bool:
     if one.sequence != other.sequence or not (one.image and other.image and one.read_depth and other.read_depth):
         return False
     try:  # files of two sizes, as nearly all are, are not read
-        return filecmp.cmp(one.image.path, other.image.path, shallow=False) and np.array_equal(
-            one.read_depth(), other.read_depth(), equal_nan=True
-        )
+        if not filecmp.cmp(one.image.path, other.image.path, shallow=False):
+            return False
+        depth = other.read_depth()
+        return bool(depth.any()) and np.array_equal(
+            one.read_depth(), depth, equal_nan=True
+        )  # in the dark all are alike
     except (SourceError, OSError):
         return False

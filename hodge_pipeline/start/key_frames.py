@@ -98,6 +98,8 @@ class KeyFrameStart(OdometryStart):
         """The key frames of a long source, every frame of a short one, with their clouds and poses by odometry."""
         can_be_tracked = any(frame.read_depth or frame.read_points for frame in source.frames)
         if len(source.frames) <= self._whole_up_to(source) or self.distance_m == 0 or not can_be_tracked:
+            if self.distance_m > 0 and self.whole_up_to == "auto" and _is_without_rate(source):
+                steps.note(Note("not a video", len(source.frames)))
             return super().begin(source, clouds, steps, workers)
         options = self._tracking(clouds)
         found = steps.step(track, source, options, title="tracking", total=len(source.frames), workers=workers)
@@ -130,6 +132,12 @@ def is_video(source: Source) -> bool:
     if len(source.frames) < 2 or not a_second or not any(frame.read_depth for frame in source.frames):
         return False
     return float(np.median(np.diff([frame.stamp_s for frame in source.frames]))) <= VIDEO_STEP_S * a_second
+
+
+def _is_without_rate(source: Source) -> bool:
+    """Whether it has depth images, and stamps that are numbers of which nothing tells how many make a second."""
+    are_numbers = len(source.frames) > 1 and not has_real_stamps(source.frames)
+    return are_numbers and not source.numbered_hz and any(frame.read_depth for frame in source.frames)
 
 
 def followers(source: Source, tracked: Tracked) -> KeyFrames:

@@ -59,6 +59,8 @@ DOUBTS = {
 """What puts the result in doubt."""
 LOOKS = {
     "option unknown": "{detail}; made by another version: it is left out of what is shown",
+    "not a video": "{count} frames are numbered, and nothing tells how many make a second: each is registered, "
+    "and none tracked. Set start.whole_up_to=1 if they are a video",
     "tracking lost": "tracking was lost at {count} {count:frame|frames} ({detail}): {count:its pose is|their poses "
     "are} guessed from {count:its|their} neighbours'",
     "no colour": "{count} of {detail} frames with depth {count:has|have} no colour image: surfaces alone place "

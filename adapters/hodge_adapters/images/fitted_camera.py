@@ -24,12 +24,26 @@ LARGEST_PX = 3.0
 """An error counts as this at most."""
 SURE = 2.5
 """Standard errors of the mean over the pairs by which a camera must fit better."""
+TOLD = 0.95
+"""Share of the pairs in which a camera must fit better than another to be told from it: what pairs share, such as the
+read-out of the shutter, no mean over them removes. Of fr1/xyz and fr1/rpy 0.75 and 0.65 fit fr2's better.
+"""
 FOCALS = tuple(0.4 * 1.12**k for k in range(13))
 """Focal lengths over the width of the image, from 103 to 35 degrees across."""
 UNSTAMPED_STEP_S = 0.1
 """Images without stamps are taken for every third of a video: of a slower one, pairs are far apart and not followed."""
 OTHER_FOCAL = 0.1
 """Relative: of four cameras of known focal length images tell it to 4 %, in whatever unit depth is."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """By how much a camera fits better than the standard one (0.05: 5 %), and in what share of the pairs of frames the
+    best one fits better than it.
+    """
+
+    gain: float
+    beaten: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -49,8 +63,8 @@ def fitting(
     colour: Sequence[Path | None],
     stamps_s: Floats,
     units_per_metre: float,
-) -> dict[str, float]:
-    """By how much (0.05: 5 %) each camera that surely fits better than the `standard` one does, the best first."""
+) -> dict[str, Fit]:
+    """The cameras that surely fit better than the `standard` one, the best first."""
     errors = _errors(list(cameras.values()), depth, colour, stamps_s, units_per_metre)
     if len(errors) < FEWEST_PAIRS:
         return {}
@@ -58,7 +72,20 @@ def fitting(
     gain = errors[:, [names.index(standard)]] - errors
     better = [k for k in range(len(names)) if _surely_positive(gain[:, k])]
     better.sort(key=lambda k: -float(gain[:, k].mean()))
-    return {names[k]: float(-np.expm1(-gain[:, k].mean())) for k in better}
+    beaten = {k: float((gain[:, better[0]] > gain[:, k]).mean()) for k in better}
+    return {names[k]: Fit(float(-np.expm1(-gain[:, k].mean())), beaten[k]) for k in better}
+
+
+def untold_camera_doubts(fits: Mapping[str, Fit]) -> tuple[Note, ...]:
+    """A doubt where the pairs of frames do not tell the best of these cameras from others of them."""
+    rivals = {name: fit for name, fit in list(fits.items())[1:] if fit.beaten < TOLD}
+    if not rivals:
+        return ()
+    best = next(iter(fits))
+    options = " or ".join(f"source.reader.camera={name}" for name in rivals)
+    shares = " and ".join(f"{100 * fit.beaten:.0f} %" for fit in rivals.values())
+    doubt = f"the camera may be {' or '.join(rivals)} in place of {best}: set {options} if it was"
+    return (Note("reader's doubt", detail=f"{doubt}; {best} fits better in only {shares} of the pairs of frames"),)
 
 
 def assumed_camera_doubts(

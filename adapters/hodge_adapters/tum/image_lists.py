@@ -13,7 +13,7 @@ from hodge_adapters.association import clock_runs, nearest_in_runs
 from hodge_adapters.images import pixels
 from hodge_adapters.images.frames import image_frame
 from hodge_adapters.text_rows import Row, inside, listed, read_rows, to_floats
-from hodge_adapters.trajectories.text import in_seconds, is_stamp
+from hodge_adapters.trajectories.text import in_seconds, is_stamp, unit_of
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera, Floats, Frame, Ints
 from hodge_pipeline.types.notes import Note
@@ -159,7 +159,7 @@ def _listed_or_named(path: Path, images: Path, notes: list[str]) -> tuple[Floats
 
 
 def _read_list(path: Path, notes: list[str]) -> tuple[Floats, list[Path], Ints]:
-    """Stamps, ascending and unique in each run, paths and runs of a list `stamp file`."""
+    """Stamps, ascending and unique in each run, paths and runs of a list `stamp file`, or of `number stamp.png`."""
     found: list[tuple[float, Path]] = []
     unreadable: list[int] = []
     outside: list[int] = []
@@ -173,7 +173,12 @@ def _read_list(path: Path, notes: list[str]) -> tuple[Floats, list[Path], Ints]:
         else:
             found.append((stamp_s, image))
     notes += _left_out(path.name, "`stamp file`", unreadable, outside)
-    stamps_s, rows, runs = _in_order(np.array([stamp for stamp, _ in found]), path.name, notes)
+    stamps = np.array([stamp for stamp, _ in found])
+    are_numbers = len(found) > 0 and unit_of(stamps)[1] == 1 and not np.mod(stamps, 1).any()
+    if are_numbers and all(_STAMP_NAME.fullmatch(image.name) for _, image in found):
+        stamps = np.array([float(image.stem) for _, image in found])
+        notes.append(f"{path.name}: it holds numbers, so stamps are those in the images' names")
+    stamps_s, rows, runs = _in_order(stamps, path.name, notes)
     return stamps_s, [found[row][1] for row in rows], runs
 
 

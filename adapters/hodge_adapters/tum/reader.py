@@ -15,7 +15,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
-from hodge_adapters.images.fitted_camera import assumed_camera_doubts, fitting
+from hodge_adapters.images.fitted_camera import Fit, assumed_camera_doubts, fitting, untold_camera_doubts
 from hodge_adapters.images.frames import Lens
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_adapters.tum.image_lists import StampedImages, find_association_file, read_pairs, stamped_images
@@ -111,9 +111,10 @@ class TumReader:
             raise SourceError(f"{path}: not a folder: give the folder that holds depth.txt and rgb.txt")
         notes: list[str] = []
         listing = read_pairs(path, self.max_difference_s, notes)
-        found, camera_file = self._intrinsics(path, listing, notes)
+        doubts = list(listing.doubts)
+        found, camera_file = self._intrinsics(path, listing, notes, doubts)
         scale = self.depth_scale or found.units_per_metre or UNITS_PER_METRE
-        doubts = (*listing.doubts, *self._doubts(found, listing, scale))
+        doubts += self._doubts(found, listing, scale)
         camera = found.camera_of(listing.depth, notes)
         lens = Lens(camera, found.distortion) if found.distortion and self.undistort else None
         if found.distortion:
@@ -129,11 +130,13 @@ class TumReader:
             frames=listing.frames(camera, poses, self.every, notes, **told),
             trajectory=trajectory,
             notes=tuple(notes),
-            doubts=doubts,
+            doubts=tuple(doubts),
             files=(*listing.files, *camera_file, *truth_file, *listing.depth, *filter(None, listing.colour)),
         )
 
-    def _intrinsics(self, path: Path, listing: StampedImages, notes: list[str]) -> tuple[Intrinsics, tuple[Path, ...]]:
+    def _intrinsics(
+        self, path: Path, listing: StampedImages, notes: list[str], doubts: list[Note]
+    ) -> tuple[Intrinsics, tuple[Path, ...]]:
         if not isinstance(self.camera, str):
             return checked(Intrinsics(*self.camera), "option camera"), ()
         if self.camera in CAMERAS:
@@ -154,13 +157,13 @@ class TumReader:
         tried = self._tried(listing)
         own = "give those of your camera with camera=[fx,fy,cx,cy]"
         if tried:
-            name, *others = tried
-            doubt = f"; set {' or '.join(f'camera={other}' for other in others)} if it was that" if others else ""
-            gains = ", ".join(f"{name} by {100 * gain:.0f} %" for name, gain in tried.items())
+            name = next(iter(tried))
+            gains = ", ".join(f"{each} by {100 * fit.gain:.0f} %" for each, fit in tried.items())
             notes.append(
                 f"intrinsics of {name} taken, tried on the images: errors are smaller than with 525 525 319.5 239.5 "
-                f"({gains}){doubt}: {own}"
+                f"({gains}): {own}"
             )
+            doubts += untold_camera_doubts(tried)
             return CAMERAS[name], ()
         notes.append(
             "default intrinsics taken (525 525 319.5 239.5), since there is no camera file, and no freiburg1, 2 or 3 "
@@ -168,8 +171,8 @@ class TumReader:
         )
         return CAMERAS["default"], ()
 
-    def _tried(self, listing: StampedImages) -> dict[str, float]:
-        """The known cameras that fit the images better than the default one, the best first, and by what share."""
+    def _tried(self, listing: StampedImages) -> dict[str, Fit]:
+        """The known cameras that fit the images better than the default one, the best first."""
         if pixels.common_size(listing.depth) != CAMERAS["default"].size:
             return {}
         scale = self.depth_scale or UNITS_PER_METRE
