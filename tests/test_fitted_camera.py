@@ -12,7 +12,7 @@ import pytest
 from hodge_adapters.icl_nuim.reader import IclNuimReader
 from hodge_adapters.images import fitted_camera
 from hodge_adapters.images.camera_files import Intrinsics
-from hodge_adapters.images.fitted_camera import Fit
+from hodge_adapters.images.fitted_camera import CameraFit
 from hodge_adapters.tum import reader
 from hodge_adapters.tum.reader import CAMERAS, TumReader
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
@@ -105,13 +105,13 @@ def test_a_camera_counts_as_told_only_if_it_fits_better_in_nearly_all_pairs(monk
         "the camera may be rival in place of best: set source.reader.camera=rival if it was; best fits better in "
         "only 75 % of the pairs of frames"
     )
-    assert fitted_camera.untold_camera_doubts({"best": Fit(0.4), "worse": Fit(0.3, 1.0)}) == ()
+    assert fitted_camera.untold_camera_doubts({"best": CameraFit(0.4), "worse": CameraFit(0.3, 1.0)}) == ()
 
 
 def test_the_day_of_the_stamps_counts_more_than_the_images(
     data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reader, "fitting", lambda *_: {"fr2": Fit(0.02), "fr3": Fit(0.02, 0.5)})
+    monkeypatch.setattr(reader, "fitting", lambda *_: {"fr2": CameraFit(0.02), "fr3": CameraFit(0.02, 0.5)})
     source = TumReader().open(linked(data_dir / "tum/fr1_rpy_part", tmp_path))
     assert source.frames[0].camera.fx == CAMERAS["fr1"].fx
     assert "intrinsics of fr1 taken: by the day of the stamps, 2011-05-10" in source.notes

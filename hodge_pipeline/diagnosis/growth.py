@@ -21,7 +21,7 @@ from hodge_pipeline.types import Bools, Floats, Ints
 HYPOTHESES = 24
 """Votes of a pair of pieces, the weightiest, that are tried as the answer."""
 MOST_COMPARED = 400
-"""Of a pair of pieces, that each is compared with: a limit on cost."""
+"""Votes of a pair of pieces that each of those tried is compared with: a limit on cost."""
 PER_FOLD = 2.0
 """Nats that agreeing edges between two sets of views add per e-fold of their number: they are one event, since places
 that look alike give many wrong edges that agree."""

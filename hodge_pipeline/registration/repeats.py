@@ -24,8 +24,7 @@ def _are_same(one: Frame, other: Frame) -> bool:
         if not filecmp.cmp(one.image.path, other.image.path, shallow=False):
             return False
         depth = other.read_depth()
-        return bool(depth.any()) and np.array_equal(
-            one.read_depth(), depth, equal_nan=True
-        )  # in the dark all are alike
+        in_the_dark = not depth.any()  # where all frames are alike
+        return not in_the_dark and np.array_equal(one.read_depth(), depth, equal_nan=True)
     except (SourceError, OSError):
         return False

@@ -37,7 +37,7 @@ OTHER_FOCAL = 0.1
 
 
 @dataclass(frozen=True)
-class Fit:
+class CameraFit:
     """By how much a camera fits better than the standard one (0.05: 5 %), and in what share of the pairs of frames the
     best one fits better than it.
     """
@@ -63,7 +63,7 @@ def fitting(
     colour: Sequence[Path | None],
     stamps_s: Floats,
     units_per_metre: float,
-) -> dict[str, Fit]:
+) -> dict[str, CameraFit]:
     """The cameras that surely fit better than the `standard` one, the best first."""
     errors = _errors(list(cameras.values()), depth, colour, stamps_s, units_per_metre)
     if len(errors) < FEWEST_PAIRS:
@@ -73,10 +73,10 @@ def fitting(
     better = [k for k in range(len(names)) if _surely_positive(gain[:, k])]
     better.sort(key=lambda k: -float(gain[:, k].mean()))
     beaten = {k: float((gain[:, better[0]] > gain[:, k]).mean()) for k in better}
-    return {names[k]: Fit(float(-np.expm1(-gain[:, k].mean())), beaten[k]) for k in better}
+    return {names[k]: CameraFit(float(-np.expm1(-gain[:, k].mean())), beaten[k]) for k in better}
 
 
-def untold_camera_doubts(fits: Mapping[str, Fit]) -> tuple[Note, ...]:
+def untold_camera_doubts(fits: Mapping[str, CameraFit]) -> tuple[Note, ...]:
     """A doubt where the pairs of frames do not tell the best of these cameras from others of them."""
     rivals = {name: fit for name, fit in list(fits.items())[1:] if fit.beaten < TOLD}
     if not rivals:

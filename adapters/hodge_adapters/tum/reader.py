@@ -15,7 +15,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
-from hodge_adapters.images.fitted_camera import Fit, assumed_camera_doubts, fitting, untold_camera_doubts
+from hodge_adapters.images.fitted_camera import CameraFit, assumed_camera_doubts, fitting, untold_camera_doubts
 from hodge_adapters.images.frames import Lens
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_adapters.tum.image_lists import StampedImages, find_association_file, read_pairs, stamped_images
@@ -171,7 +171,7 @@ class TumReader:
         )
         return CAMERAS["default"], ()
 
-    def _tried(self, listing: StampedImages) -> dict[str, Fit]:
+    def _tried(self, listing: StampedImages) -> dict[str, CameraFit]:
         """The known cameras that fit the images better than the default one, the best first."""
         if pixels.common_size(listing.depth) != CAMERAS["default"].size:
             return {}

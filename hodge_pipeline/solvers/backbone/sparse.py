@@ -42,7 +42,7 @@ class NormalEquations:
 
     @classmethod
     def of(cls, edges: Ints, count: int) -> NormalEquations:
-        """The network of these edges, none from a vertex to itself."""
+        """That of these edges, none from a vertex to itself."""
         component = connected_components(edges, count)
         held = first_of_component(component)
         free = np.flatnonzero(~held)
