@@ -152,6 +152,10 @@ def test_a_path_in_doubt_says_so_first(report: Report) -> None:
     doubt = Note("reader's doubt", detail="a camera of focal length 525 is assumed")
     verdict = judge(replace(report, notes=(doubt,)))
     assert verdict.headline.startswith("In doubt, since the camera is assumed and images do not confirm it: improved")
+    verdict = judge(
+        replace(report, notes=(Note("focal length", detail="574 pixels (568 to 590) better than its 644"),))
+    )
+    assert verdict.headline.startswith("In doubt, since images contradict the camera's focal length: improved")
 
 
 def test_lost_frames_and_missing_images_come_first_where_they_are_most(report: Report) -> None:

@@ -24,6 +24,7 @@ from hodge_pipeline.pairs.edits import Edit, History, write_history
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.registration import tracking
 from hodge_pipeline.registration.clouds import CloudOptions
+from hodge_pipeline.registration.focal import Focal
 from hodge_pipeline.registration.odometry import Odometry
 from hodge_pipeline.registration.readout import Readout
 from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
@@ -456,9 +457,19 @@ def test_a_clock_that_goes_back_is_said_and_costs_no_frame(sequence: Path, whole
     assert np.abs(poses - expected).max() < 0.06
 
 
-def test_an_estimated_read_out_is_told_and_used_by_the_frames(sequence: Path, whole: Tracked, tmp_path: Path) -> None:
+def test_an_estimated_read_out_is_told_and_used_by_the_frames(
+    sequence: Path, whole: Tracked, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     source, none = TumReader().open(sequence), whole
+    used = list[float]()
+
+    def focal(*given: Any) -> Focal:
+        used.append(given[4])
+        return Focal(525.0, 610.4, 600.0, 620.0)
+
+    monkeypatch.setattr(tracked, "estimate_focal", focal)
     found, notes = track(source, tmp_path / "found", Readout(0.022, 0.02, 0.0239))
+    assert used == [0.022] and any("610 pixels (600 to 620) better than its 525" in note for note in notes)
     assert none.readout_s == 0.0 and followers(source, found).readout_s == 0.022
     assert any("estimated: 22 ms (20 to 24)" in note for note in notes)
     step, poses = Step(tmp_path, no_progress, lambda *_: None), all_poses(source, none, none.world_from_key)

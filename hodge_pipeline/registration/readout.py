@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.reposing import groups, seen_at_stamp
+from hodge_pipeline.registration.reposing import view_at_stamps
 from hodge_pipeline.registration.resection import resect, robust_cost
-from hodge_pipeline.registration.shutter import at_frame_stamp
-from hodge_pipeline.registration.sightings import Sightings
-from hodge_pipeline.store import artifacts
+from hodge_pipeline.registration.sightings import View, views
 from hodge_pipeline.types import Camera, Floats, Frame
-from hodge_pipeline.types.arrays import evenly
+from hodge_pipeline.types.arrays import evenly, groups
 
 TRIED_S = np.linspace(0.0, 0.035, 8)
 """Seconds: video has 30 images a second, and a read-out is no longer than the time between two images."""
@@ -24,9 +22,8 @@ SHORTEST_S = 0.005
 """A shorter one moves no pixel by one at 30 degrees a second; on rendered frames estimates are off by up to 2 ms."""
 WIDEST = 0.5
 """Width of the interval over the value: a quarter of the shutter's effect is left at its ends."""
-MOST_BLOCKS, MOST_VIEWS = 10, 100
+MOST_VIEWS = 100
 """That are looked at, evenly spread: a view takes 10 CPU ms."""
-FEWEST_CORNERS = 60
 FEWEST_KEYS = 5
 """Key frames, by which the interval is drawn anew: what is seen of one shares its errors."""
 DRAWS = 500
@@ -39,16 +36,6 @@ class Readout:
     best_s: float
     low_s: float
     high_s: float
-
-
-@dataclass(frozen=True)
-class View:
-    """What a frame saw of its key frame: `points (n, 3)` in the key frame's axes, `seen (n, 3)` columns u, v, z."""
-
-    key: int
-    row: int
-    points: Floats
-    seen: Floats
 
 
 def with_readout(camera: Camera, readout_s: float) -> Camera:
@@ -69,43 +56,25 @@ def estimate_readout(
     moves = np.asarray(twists.any(axis=1))
     if len(cameras) > 1 or camera is None or camera.readout_s or not moves.any():
         return None
-    views = [view for view in _views(sightings) if moves[view.key] and moves[view.row]]
+    moving = [view for view in views(sightings) if moves[view.key] and moves[view.row]]
     keys, costs = list[int](), list[Floats]()
-    for view in (views[at] for at in evenly(len(views), MOST_VIEWS)):
-        delays_s = frames[view.key].colour_delay_s, frames[view.row].colour_delay_s
+    for view in (moving[at] for at in evenly(len(moving), MOST_VIEWS)):
         start = se3.inverse(world_from_cam[view.key]) @ world_from_cam[view.row]
-        cost = _costs(view, camera, delays_s, (twists[view.key], twists[view.row]), start, unit_m)
+        cost = _costs(view, camera, frames, twists, start, unit_m)
         if cost is not None:
             keys.append(view.key)
             costs.append(cost)
     return _minimum(np.array([np.sum([costs[own] for own in rows], axis=0) for _, rows in groups(np.array(keys))]))
 
 
-def _views(sightings: Path) -> Iterator[View]:
-    paths = sorted(sightings.glob("*.npz"))
-    for at in evenly(len(paths), MOST_BLOCKS):
-        block = artifacts.load(paths[at], Sightings)
-        for row, own in groups(block.frame):
-            for key, part in groups(block.key[block.corner[own]]):
-                if key != row and len(part) >= FEWEST_CORNERS:
-                    yield View(key, row, block.points[block.corner[own[part]]], block.seen[own[part]])
-
-
 def _costs(
-    view: View,
-    camera: Camera,
-    delays_s: tuple[float, float],
-    twists: tuple[Floats, Floats],
-    start: Floats,
-    unit_m: float,
+    view: View, camera: Camera, frames: Sequence[Frame], twists: Floats, start: Floats, unit_m: float
 ) -> Floats | None:
-    """Robust cost (T,) of a view at each time tried; delays and twists are the key frame's and the frame's."""
+    """Robust cost (T,) of a view at each time tried."""
     costs = []
     for readout_s in TRIED_S.tolist():
         tried = replace(camera, readout_s=readout_s)
-        points = at_frame_stamp(view.points, tried, delays_s[0], twists[0])
-        expected_z = se3.transform(se3.inverse(start), points)[:, 2]
-        seen = seen_at_stamp(view.seen, expected_z, tried, delays_s[1], twists[1])
+        points, seen = view_at_stamps(view, tried, frames, twists, start)
         found = resect(points, seen, tried, start, unit_m)
         if found is None:
             return None

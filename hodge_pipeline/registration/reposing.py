@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,9 +11,10 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.registration.resection import back_project, project, resect
 from hodge_pipeline.registration.shutter import at_frame_stamp
-from hodge_pipeline.registration.sightings import Sightings
+from hodge_pipeline.registration.sightings import Sightings, View
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.types import Bools, Camera, Floats, Ints
+from hodge_pipeline.types import Bools, Camera, Floats, Frame, Ints
+from hodge_pipeline.types.arrays import groups
 
 FEWEST_POINTS = 20
 """That must agree on a pose for it to be believed."""
@@ -73,15 +75,6 @@ def repose(sightings: Sightings, block: PosedBlock) -> Reposed:
     return Reposed(np.array(rows, np.int64), motions, known, np.array(misfits, np.int64))
 
 
-def groups(labels: Ints) -> list[tuple[int, Ints]]:
-    """The rows of each label, labels ascending; none of a block that saw nothing, as in the dark."""
-    if not len(labels):
-        return []
-    order = np.argsort(labels, kind="stable")
-    values, begin = np.unique(labels[order], return_index=True)
-    return list(zip(values.tolist(), np.split(order, begin[1:]), strict=True))
-
-
 def _at_stamps(sightings: Sightings, block: PosedBlock, at: dict[int, int]) -> Floats:
     """Columns u, v, z (S, 3) of all sightings as they would be at the stamps of their frames."""
     out = sightings.seen.copy()
@@ -102,6 +95,15 @@ def seen_at_stamp(seen: Floats, expected_z: Floats, camera: Camera, colour_delay
     moved = project(at_frame_stamp(back_project(whole, camera), camera, colour_delay_s, twist), camera)
     moved[no_depth, 2] = np.nan
     return moved
+
+
+def view_at_stamps(
+    view: View, camera: Camera, frames: Sequence[Frame], twists: Floats, key_from_cam: Floats
+) -> tuple[Floats, Floats]:
+    """A view's points and what was seen of them, as they would be at the stamps of the key frame and of the frame."""
+    points = at_frame_stamp(view.points, camera, frames[view.key].colour_delay_s, twists[view.key])
+    expected_z = se3.transform(se3.inverse(key_from_cam), points)[:, 2]
+    return points, seen_at_stamp(view.seen, expected_z, camera, frames[view.row].colour_delay_s, twists[view.row])
 
 
 def _solved_corners(sightings: Sightings, block: PosedBlock, at: dict[int, int], seen: Floats) -> Floats:

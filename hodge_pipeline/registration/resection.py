@@ -103,8 +103,38 @@ def _agree(points: Floats, seen: Floats, camera: Camera, pose: Floats) -> Bools:
     return np.asarray(near & (np.abs(residual[:, 2]) < GATE_PX / PIXEL_SIGMA * sigma_z))
 
 
+def focal_evidence(
+    points: Floats, seen: Floats, camera: Camera, known_from_cam: Floats, unit_m: float = 1.0
+) -> tuple[float, float]:
+    """What points say of the logarithm of the focal length, where the pose, with which they fit best, is free: minus
+    half of χ²'s gradient, and their information. The points are of pixels of the same camera.
+    """
+    points, seen = points / unit_m, seen / [1.0, 1.0, unit_m]
+    found = _linearised(points, seen, camera, se3.rescaled(known_from_cam, 1 / unit_m), 1.0)
+    if found is None:
+        return 0.0, 0.0
+    jacobian, white = found
+    *of_pose, of_focal = jacobian
+    basis = np.linalg.qr(np.array(of_pose).T)[0]
+    of_focal = of_focal - basis @ (basis.T @ of_focal)
+    return float(of_focal @ white), float(of_focal @ of_focal)
+
+
 def _step(points: Floats, seen: Floats, camera: Camera, pose: Floats, scale: float) -> tuple[Floats, Floats] | None:
     """The Gauss-Newton step ξ (6,) and the information (6, 6), with Cauchy weights."""
+    found = _linearised(points, seen, camera, pose, scale)
+    if found is None:
+        return None
+    jacobian, white = found[0][:6], found[1]
+    information = jacobian @ jacobian.T
+    damped = information + 1e-9 * np.trace(information) * np.eye(6)
+    return np.linalg.solve(damped, jacobian @ white), information
+
+
+def _linearised(
+    points: Floats, seen: Floats, camera: Camera, pose: Floats, scale: float
+) -> tuple[Floats, Floats] | None:
+    """Derivatives (7, 3n) by ξ and the focal length's logarithm, and residuals (3n,), all with Cauchy weights."""
     in_cam, residual = _residuals(points, seen, camera, pose)
     usable = np.isfinite(residual).all(axis=1)
     if usable.sum() < FEWEST:
@@ -117,7 +147,8 @@ def _step(points: Floats, seen: Floats, camera: Camera, pose: Floats, scale: flo
     sigma_z = np.where(no_depth, np.inf, DEPTH_SIGMAS * depth_sigma(z))
     gain = np.sqrt(weight) / [PIXEL_SIGMA / camera.fx * z, PIXEL_SIGMA / camera.fy * z, sigma_z]
     u, v, one, none = x / z, y / z, np.ones(len(z)), np.zeros(len(z))
-    # of a point in a camera that moves by exp(ξ), which moves by −(φ × p + ρ)
+    narrowed = -points[usable] * [1.0, 1.0, 0.0] @ pose[:3, :3]
+    # of a point in a camera that moves by exp(ξ), which moves by −(φ × p + ρ), and of one whose pixel is kept
     moved = [
         [u * y, z + v * y, -y],
         [-z - u * x, -v * x, x],
@@ -125,9 +156,6 @@ def _step(points: Floats, seen: Floats, camera: Camera, pose: Floats, scale: flo
         [-one, none, none],
         [none, -one, none],
         [u, v, -one],
+        [narrowed[:, 0] - u * narrowed[:, 2] + x, narrowed[:, 1] - v * narrowed[:, 2] + y, narrowed[:, 2]],
     ]
-    jacobian = (np.array(moved) * gain).reshape(6, -1)
-    information = jacobian @ jacobian.T
-    gradient = jacobian @ (white * np.sqrt(weight)[:, None]).T.ravel()
-    damped = information + 1e-9 * np.trace(information) * np.eye(6)
-    return np.linalg.solve(damped, gradient), information
+    return (np.array(moved) * gain).reshape(7, -1), (white * np.sqrt(weight)[:, None]).T.ravel()

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from hodge_pipeline.registration.flow import Followed
+from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types.arrays import evenly, groups
+
+MOST_BLOCKS = 10
+"""That views are taken of, evenly spread."""
+FEWEST_CORNERS = 60
+"""Of a view."""
 
 
 @dataclass(frozen=True)
@@ -44,3 +52,24 @@ class Sightings:
             corner=np.concatenate([no_rows, *(first[pair[0]] + found[pair].rows for pair in pairs)]),
             seen=np.concatenate([np.zeros((0, 3)), *(found[pair].seen for pair in pairs)]),
         )
+
+
+@dataclass(frozen=True)
+class View:
+    """What a frame saw of its key frame: `points (n, 3)` in the key frame's axes, `seen (n, 3)` columns u, v, z."""
+
+    key: int
+    row: int
+    points: Floats
+    seen: Floats
+
+
+def views(sightings: Path) -> Iterator[View]:
+    """The views of a folder of `Sightings`, of some of its blocks."""
+    paths = sorted(sightings.glob("*.npz"))
+    for at in evenly(len(paths), MOST_BLOCKS):
+        block = artifacts.load(paths[at], Sightings)
+        for row, own in groups(block.frame):
+            for key, part in groups(block.key[block.corner[own]]):
+                if key != row and len(part) >= FEWEST_CORNERS:
+                    yield View(key, row, block.points[block.corner[own[part]]], block.seen[own[part]])

@@ -51,6 +51,7 @@ REASONS = {
     "reader's doubt": "the camera is assumed and images do not confirm it",
     "path scaled": "the path is of another size than the one given",
     "depth unit": "depth is probably not in metres",
+    "focal length": "images contradict the camera's focal length",
 }
 """How a headline begins where the run says that its result may be wrong, whatever was measured, and why; lost frames
 where they are `MOSTLY_LOST`."""

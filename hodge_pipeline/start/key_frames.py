@@ -15,6 +15,7 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline.complex.components import connected_components, in_runs
 from hodge_pipeline.registration.bridging import bridge
 from hodge_pipeline.registration.clouds import CloudOptions, no_clouds
+from hodge_pipeline.registration.focal import estimate_focal
 from hodge_pipeline.registration.gaps import told_gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chained
 from hodge_pipeline.registration.readout import estimate_readout, with_readout
@@ -200,6 +201,10 @@ def track(source: Source, options: TrackingOptions, *, workers: Workers, step: S
         tracked = replace(tracked, readout_s=readout.best_s)
         best, low, high = (f"{1e3 * time_s:.0f}" for time_s in (readout.best_s, readout.low_s, readout.high_s))
         notes = (*notes, Note("readout", detail=f"{best} ms ({low} to {high})"))
+    focal = estimate_focal(sightings, source.frames, first, twists, tracked.readout_s, options.clouds.unit_m)
+    if focal is not None and focal.is_other:
+        told = f"{focal.best:.0f} pixels ({focal.low:.0f} to {focal.high:.0f}) better than its {focal.own:.0f}"
+        notes = (*notes, Note("focal length", detail=told))
     _move_landmarks(source, tracked, twists)
     blocks.remove()
     step.note(*notes)

@@ -17,3 +17,12 @@ def evenly(available: int, most: int) -> Ints:
     """At most so many rows (N,) of `available`, spread evenly, the first and the last among them."""
     kept = max(min(most, available), 0)
     return np.unique(np.linspace(0, available - 1, kept).round().astype(np.int64)) if kept else np.zeros(0, np.int64)
+
+
+def groups(labels: Ints) -> list[tuple[int, Ints]]:
+    """The rows of each of the labels (N,), labels ascending."""
+    if not len(labels):
+        return []
+    order = np.argsort(labels, kind="stable")
+    values, begin = np.unique(labels[order], return_index=True)
+    return list(zip(values.tolist(), np.split(order, begin[1:]), strict=True))

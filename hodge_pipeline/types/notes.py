@@ -29,6 +29,8 @@ INPUTS = {
     "depth steps": "depth is of another sensor than a Kinect, Xtion, Astra or Structure sensor, or in another unit: "
     "{detail}",
     "depth range": "{detail}: is the depth scale right (source.reader.depth_scale)?",
+    "focal length": "The camera's intrinsics are probably wrong: what frames saw of each other fits a focal length of "
+    "{detail} (source.reader.camera, or the file it is read from).",
     "millimetres": "{detail}",
     "other scale": "The true path is {detail} times as large as this one: depth is read in the wrong unit (--set "
     "source.reader.depth_scale), or with another camera's focal length, or the truth is not in metres, or not of the "
