@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ import hodge_pipeline
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
+from hodge_pipeline.complex.components import in_runs
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.executors.local import InProcess
@@ -256,14 +257,24 @@ def test_frames_that_repeat_the_images_before_are_said_and_posed_by_their_neighb
 
 @pytest.mark.parametrize("blank", [range(0, 3), range(46, 51)])
 def test_frames_with_depth_and_a_black_image_are_said(sequence: Path, tmp_path: Path, blank: range) -> None:
-    """Of several blocks each is counted once, and those without depth, or darker and brighter ones, are not."""
+    """Of several blocks each is counted once, and those without depth, or darker and brighter ones, are not; those that
+    cannot be read are said with the reason.
+    """
     source = with_dark(TumReader().open(sequence), blank, images=True, depth=False)
     frames = list(with_dark(source, range(30, 33), images=True).frames)
     frames[35], frames[55] = exposed(frames[35], 0.1), exposed(frames[55], 4.0)
+
+    def unreadable() -> NoReturn:
+        raise SourceError(f"{source.path}/rgb/20.png: the image is truncated")
+
+    frames[20], frames[47] = (replace(frames[row], read_colour=unreadable) for row in (20, BLOCK - 1))
     _, notes = track(replace(source, frames=tuple(frames)), tmp_path / "blank")
-    said = [note for note in notes if "shows nothing" in note]
-    assert len(said) == 1 and said[0].startswith(f"{len(blank)} frames have depth")
-    assert f"({blank[0]}–{blank[-1]})" in said[0]
+    (said,) = [note for note in notes if "shows nothing" in note]
+    blank_rows = np.setdiff1d(blank, [BLOCK - 1])
+    assert said.startswith(f"{len(blank_rows)} frames have depth")
+    assert f"({in_runs(blank_rows, np.arange(FRAMES))})" in said
+    (said,) = [note for note in notes if "cannot be read" in note]
+    assert said == "2 frames have images that cannot be read (20, 47), such as rgb/20.png: the image is truncated"
 
 
 def test_frames_that_clouds_place_move_with_their_key_frame_where_flow_goes_on(sequence: Path, tmp_path: Path) -> None:

@@ -7,14 +7,14 @@ sensor warps alike in every frame can fit each other best where no camera was.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
 from hodge_pipeline.registration.flow import FlowImage, find_corners, flow_image, follow
 from hodge_pipeline.stages import Step
-from hodge_pipeline.types import Floats, Ints, Source
+from hodge_pipeline.types import Floats, Frame, Ints, Source
 
 MOST_STEPS = 100
 """Evenly over the sequence: 30 ms each at 640x480."""
@@ -34,10 +34,9 @@ def step_errors(source: Source, pairs: Ints, pose_sets: Floats, unit_m: float, *
     read, or too few of its corners agree on a motion.
     """
     off_m = np.full((len(pose_sets), len(pairs)), np.nan)
-    read = partial(flow_image, range_m=(RANGE_M[0] * unit_m, RANGE_M[1] * unit_m), unit_m=unit_m)
     images: dict[int, FlowImage | None] = {}
     for column, (i, j) in enumerate(pairs.tolist()):
-        images = {row: images[row] if row in images else read(source.frames[row]) for row in (i, j)}
+        images = {row: images[row] if row in images else _read(source.frames[row], unit_m) for row in (i, j)}
         one, other = images[i], images[j]
         i_from_j = se3.inverse(pose_sets[:, i]) @ pose_sets[:, j]
         found = None if one is None or other is None else follow(find_corners(one), other, i_from_j[0])
@@ -45,3 +44,10 @@ def step_errors(source: Source, pairs: Ints, pose_sets: Floats, unit_m: float, *
             off_m[:, column] = np.linalg.norm((se3.inverse(found.key_from_view) @ i_from_j)[:, :3, 3], axis=1)
         step.advance(1)
     return StepErrors(off_m)
+
+
+def _read(frame: Frame, unit_m: float) -> FlowImage | None:
+    try:
+        return flow_image(frame, (RANGE_M[0] * unit_m, RANGE_M[1] * unit_m), unit_m)
+    except (SourceError, OSError):
+        return None

@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.errors import SourceError
 from hodge_pipeline.registration.landmarks import sound_depth
 from hodge_pipeline.registration.resection import Resection, back_project, project, resect
 from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame
@@ -76,13 +75,13 @@ class Followed:
 
 
 def flow_image(frame: Frame, range_m: tuple[float, float], unit_m: float = 1.0) -> FlowImage | None:
-    """The frame's image; None where it has no colour, depth or camera, or its files cannot be read."""
+    """The frame's image; None where it has no colour, depth or camera.
+
+    Raises `SourceError` or `OSError` where its files cannot be read.
+    """
     if frame.read_colour is None or frame.read_depth is None or frame.camera is None:
         return None
-    try:
-        colour, depth = frame.read_colour(), frame.read_depth()
-    except (SourceError, OSError):
-        return None
+    colour, depth = frame.read_colour(), frame.read_depth()
     grey = cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY)
     if grey.shape != depth.shape:
         grey = cv2.resize(grey, depth.shape[::-1], interpolation=cv2.INTER_AREA)

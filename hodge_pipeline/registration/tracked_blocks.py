@@ -10,10 +10,22 @@ import numpy as np
 
 from hodge_pipeline.registration.sightings import Sightings
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, PointCloud
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, PointCloud, Words
 
 STEP, CLOUD, SIGHTING = "step_", "cloud_", "sighting_"
-COLUMNS = ("keys", "rows", "anchors", "key_from_row", "fitness", "moving", "doubtful", "blank", "apart")
+COLUMNS = (
+    "keys",
+    "rows",
+    "anchors",
+    "key_from_row",
+    "fitness",
+    "moving",
+    "doubtful",
+    "blank",
+    "apart",
+    "unread",
+    "unread_why",
+)
 
 
 @dataclass(frozen=True)
@@ -22,7 +34,8 @@ class BlockRows:
     next, and for every row the row of the key frame that it was followed from, the motion, and its fitness: NaN where
     the motion is a guess; and the rows `moving` of frames much of which moved otherwise than the camera, `doubtful` of
     those whose motion may be that of an object, `blank` of those that have depth but show nothing, and `apart` of those
-    of these whose key frame flow joins with the next one: they do not share the error of that step.
+    of these whose key frame flow joins with the next one: they do not share the error of that step; and the rows
+    `unread` of frames whose images cannot be read, and why.
 
     A step of fitness 0 is a guess too. The block's last row is the first of the next one.
     """
@@ -37,6 +50,8 @@ class BlockRows:
     doubtful: Ints
     blank: Ints
     apart: Ints
+    unread: Ints
+    unread_why: Words
     notes: tuple[str, ...]
 
 

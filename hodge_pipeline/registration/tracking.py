@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
 from hodge_pipeline.registration.clouds import CloudOptions, cloud_or_note, is_blank
 from hodge_pipeline.registration.flow import Corners, FlowImage, Followed, find_corners, flow_image, follow
 from hodge_pipeline.registration.moving import AT_REST, Moments, contradicting, misplaced, rival_motion
@@ -97,15 +98,19 @@ class _View:
 
     def __init__(self, options: TrackingOptions, frame: Frame, place: int) -> None:
         self._options, self._frame, self.place = options, read_once(frame), place
-        self.left_out = 0.0
+        self.left_out, self.unread = 0.0, ""
         self.twist: Floats = np.zeros(6)
         self.colour_delay_s = frame.colour_delay_s
 
     @cached_property
     def image(self) -> FlowImage | None:
-        """None of a frame that flow cannot follow."""
+        """None of a frame that flow cannot follow; where its images cannot be read, `unread` says why."""
         clouds = self._options.clouds
-        return flow_image(self._frame, (clouds.min_range_m, clouds.max_range_m), clouds.unit_m)
+        try:
+            return flow_image(self._frame, (clouds.min_range_m, clouds.max_range_m), clouds.unit_m)
+        except (SourceError, OSError) as error:
+            self.unread = str(error)
+            return None
 
     @property
     def is_blank(self) -> bool:
@@ -161,6 +166,7 @@ class _Tracker:
         self._corner_points: dict[int, Floats] = {}
         self._sightings: dict[tuple[int, int], Followed] = {}
         self._moving, self._doubtful, self._blank = set[int](), set[int](), set[int]()
+        self._unread = dict[int, str]()
         self._velocity: Floats = np.zeros(6)
         self._times = block.times + [frame.colour_delay_s for frame in block.frames]
         self._usual_step = float(np.median(np.diff(block.times))) if len(block.times) > 1 else 1.0
@@ -171,10 +177,10 @@ class _Tracker:
         if self._block.warm_up:
             self._warm_up(start)
         self._begin(start)
-        self._blank |= {first} if start.is_blank else set()
+        self._look_at(start)
         for place in range(first + 1, count):
             view = self._view(place)
-            self._blank |= {place} if view.is_blank else set()
+            self._look_at(view)
             self._follow(view, is_last=place == count - 1)
         self._keep_cloud(self._keys[-1])
         rows = self._block.rows
@@ -192,9 +198,17 @@ class _Tracker:
             doubtful=self._rows_at(self._doubtful),
             blank=self._rows_at(self._blank),
             apart=self._rows_at(self._apart()),
+            unread=rows[list(self._unread)],
+            unread_why=np.array(list(self._unread.values()), np.str_),
             notes=tuple(note for _, note in self._clouds.values() if note),
             sightings=self._kept_sightings(first),
         )
+
+    def _look_at(self, view: _View) -> None:
+        if view.is_blank:
+            self._blank.add(view.place)
+        if view.unread:
+            self._unread[view.place] = view.unread
 
     def _apart(self) -> set[int]:
         """The places of blank frames that clouds placed, whose key frame flow has joined with the next one."""

@@ -280,6 +280,11 @@ def _notes(source: Source, tracked: Tracked, parts: list[BlockRows], repeats: In
         notes.append(Note("repeated images", len(repeats), in_runs(repeats, ids)))
     if len(lost):
         notes.append(Note("tracking lost", len(lost), in_runs(lost, ids)))
+    unread = {int(row): why for part in parts for row, why in zip(part.unread, part.unread_why, strict=True)}
+    if unread:
+        rows = np.array(sorted(unread))
+        first = unread[rows[0]].replace(f"{source.path}/", "")
+        notes.append(Note("images unread", len(rows), f"({in_runs(rows, ids)}), such as {first}"))
     blank = np.unique(np.concatenate([part.blank for part in parts]))
     if len(blank):
         notes.append(Note("blank images", len(blank), in_runs(blank, ids)))

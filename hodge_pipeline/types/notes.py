@@ -69,6 +69,7 @@ LOOKS = {
     "{count:it|them}",
     "no pose near": "the trajectory beside the {count} {count:frame|frames} has no pose near in time of any: is it of "
     "another clock?",
+    "images unread": "{count} {count:frame has an image|frames have images} that cannot be read {detail}",
     "repeated images": "{count} {count:frame repeats|frames repeat} the images of the frame before ({detail}), as "
     "where a camera stalls: {count:its pose is|their poses are} guessed from {count:its|their} neighbours'",
     "blank images": "{count} {count:frame has|frames have} depth, but a colour image that shows nothing, black or of "
