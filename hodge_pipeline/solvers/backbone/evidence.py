@@ -66,7 +66,7 @@ class WrongLoops:
         """Where right loops have such covariances (K, p, p): along an axis in which places hardly differ a wrong loop
         is as far off as a right one.
         """
-        shape = np.maximum(self.spread, ((self.along @ covariance) * self.along).sum(axis=2))
+        shape = np.maximum(self.spread, np.einsum("kij,kij->ki", self.along @ covariance, self.along))
         chi2, size = (self.squared / shape).sum(axis=1), shape.shape[1]
         chi2[self.apart] = size  # how two paths lie is not known
         return np.asarray(log_student(chi2, size, freedom=1.0) - 0.5 * np.log(shape).sum(axis=1))
