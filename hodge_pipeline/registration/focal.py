@@ -13,7 +13,7 @@ from hodge_pipeline.registration.readout import with_readout
 from hodge_pipeline.registration.reposing import view_at_stamps
 from hodge_pipeline.registration.resection import focal_evidence, resect
 from hodge_pipeline.registration.sightings import views
-from hodge_pipeline.types import Floats, Frame
+from hodge_pipeline.types import Camera, Floats, Frame
 from hodge_pipeline.types.arrays import evenly, groups
 
 MOST_VIEWS = 50
@@ -63,14 +63,7 @@ def estimate_focal(
     drawn = np.random.default_rng(0).integers(0, len(keys), (DRAWS, len(keys)))
     log = 0.0
     for _ in range(ROUNDS):
-        evidence = np.zeros((len(chosen), 2))
-        tried = replace(camera, fx=camera.fx * np.exp(log), fy=camera.fy * np.exp(log))
-        for at, (points, seen) in enumerate(stamped):
-            points = points * [np.exp(-log), np.exp(-log), 1.0]
-            fit = resect(points, seen, tried, poses[at], unit_m)
-            if fit is not None:
-                poses[at] = fit.known_from_cam
-                evidence[at] = focal_evidence(points, seen, tried, fit.known_from_cam, unit_m)
+        evidence = _evidence(stamped, poses, camera, log, unit_m)
         of_key = np.array([evidence[rows].sum(axis=0) for _, rows in keys])
         gradient, information = of_key[drawn].sum(axis=1).T
         if not information.all():
@@ -78,3 +71,18 @@ def estimate_focal(
         low, high = camera.fx * np.exp(log + np.quantile(gradient / information, [0.01, 0.99]))
         log += float(evidence[:, 0].sum() / evidence[:, 1].sum())
     return Focal(camera.fx, camera.fx * float(np.exp(log)), float(low), float(high))
+
+
+def _evidence(
+    stamped: Sequence[tuple[Floats, Floats]], poses: list[Floats], camera: Camera, log: float, unit_m: float
+) -> Floats:
+    """`focal_evidence` (V, 2) of each view at exp(log) times the camera's focal length; updates `poses`."""
+    evidence = np.zeros((len(stamped), 2))
+    tried = replace(camera, fx=camera.fx * np.exp(log), fy=camera.fy * np.exp(log))
+    for at, (points, seen) in enumerate(stamped):
+        points = points * [np.exp(-log), np.exp(-log), 1.0]
+        fit = resect(points, seen, tried, poses[at], unit_m)
+        if fit is not None:
+            poses[at] = fit.known_from_cam
+            evidence[at] = focal_evidence(points, seen, tried, fit.known_from_cam, unit_m)
+    return evidence

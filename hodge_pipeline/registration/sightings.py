@@ -36,8 +36,8 @@ class Sightings:
 
     @classmethod
     def of(cls, found: Mapping[tuple[int, int], Followed], points: Mapping[int, Floats], rows: Ints) -> Sightings:
-        """The columns of what was found at (key frame's place, frame's place) in a block of these rows; `points (n, 3)`
-        are the corners of the key frame at a place.
+        """The sightings `found` at (key frame's place, frame's place) in a block of these rows; `points (n, 3)` are the
+        corners of the key frame at a place.
         """
         pairs = sorted(found)
         keys = sorted({key for key, _ in pairs})

@@ -104,7 +104,7 @@ class _View:
 
     @cached_property
     def image(self) -> FlowImage | None:
-        """None of a frame that flow cannot follow; where its images cannot be read, `unread` says why."""
+        """The image for optical flow, None where it lacks colour, depth or camera, or cannot be read (see `unread`)."""
         clouds = self._options.clouds
         try:
             return flow_image(self._frame, (clouds.min_range_m, clouds.max_range_m), clouds.unit_m)
@@ -351,7 +351,7 @@ class _Tracker:
         return found
 
     def _from_missed(self, view: _View, missed: _View, to_key: Registration) -> Registration:
-        """Two frames that know each other but not the key frame: tracking is lost, and begins anew with the first."""
+        """The motion from the frame lost before, which becomes a key frame by a guess, where these two register."""
         found = self._registrar.register(missed.prepared, view.prepared, np.eye(4))
         if not self._is_good(found):
             return to_key
