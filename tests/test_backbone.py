@@ -192,17 +192,15 @@ def test_random_motions_between_places_seen_again_are_not_used(share: float, dat
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize(("loops", "wrong", "group"), [(20, 0, 1), (5, 0, 1), (26, 60, 1), (26, 60, 10)])
 def test_a_path_that_closes_once_is_closed(dimension: int, loops: int, wrong: int, group: int) -> None:
-    for seed in range(2):
-        made = round_trip(seed, loops, dimension=dimension, wrong=wrong, group=group)
-        kept = diagnose(made.graph).kept
-        assert kept[made.right].all() and (kept & ~made.right).sum() <= 1
+    made = round_trip(dimension - 2, loops, dimension=dimension, wrong=wrong, group=group)
+    kept = diagnose(made.graph).kept
+    assert kept[made.right].all() and (kept & ~made.right).sum() <= 1
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_loops_of_one_mistaken_place_close_no_path(dimension: int) -> None:
-    for seed in range(2):
-        made = round_trip(seed, 10, dimension=dimension, only_wrong=True)
-        assert not diagnose(made.graph).kept[~made.right].any()
+    made = round_trip(dimension - 2, 10, dimension=dimension, only_wrong=True)
+    assert not diagnose(made.graph).kept[~made.right].any()
 
 
 def test_loops_that_are_stated_to_be_exact_refute_no_others(data_dir: Path) -> None:

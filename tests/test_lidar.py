@@ -222,7 +222,7 @@ class Flight(CarFree):
 
 @pytest.mark.parametrize("path", [Flight(4.0), Road(25.0)], ids=["flown", "fast"])
 def test_sweeps_are_followed_from_the_first_at_any_speed(path: Flight | Road, tmp_path: Path) -> None:
-    count = 25
+    count = 15
     own = SpinningScanner(cast(Road, path), 0, beams=16, columns=360, noise=1.0)
     for number in range(count):
         write_organised(tmp_path / f"{number}.pcd", own.sweep(number), 16 * 360, np.nan)
@@ -288,13 +288,13 @@ def test_two_scanners_in_a_folder_are_followed_apart(tmp_path: Path) -> None:
     folder.mkdir()
     car_from_front = se3.exp(np.array([0, 0, np.pi / 2, 1.0, 0.5, -0.8]))
     top, front = (SpinningScanner(road, 0, beams, columns=240, noise=1.0) for beams in (16, 12))
-    for number in range(12):
+    for number in range(8):
         write_organised(folder / f"top_{number}.pcd", top.sweep(number), 16 * 240, np.nan)
         points = se3.transform(se3.inverse(car_from_front), front.sweep(number).points.astype(float))
         write_ply(folder / f"{number}_front.ply", PointCloud(points.astype(np.float32)))
     done = run(load_recipe("lidar", SHORT, folder), tmp_path / "run")
-    assert "(*_front.ply 12, top_*.pcd 12): each is a sequence" in " ".join(done.source.notes)
-    exact = road.world_from_car(np.arange(12) * REVOLUTION_S)
+    assert "(*_front.ply 8, top_*.pcd 8): each is a sequence" in " ".join(done.source.notes)
+    exact = road.world_from_car(np.arange(8) * REVOLUTION_S)
     names = np.array([frame.sequence for frame in done.source.frames])
     for name, true in (("top_*.pcd", exact), ("*_front.ply", exact @ car_from_front)):
         assert absolute_error(done.poses[names == name], true).max_m < 0.5
@@ -354,7 +354,7 @@ def test_poses_of_sweeps_are_never_worse_than_they_came(kind: str, tmp_path: Pat
     assert absolute_error(refined.poses, exact).max_m < 0.05
 
 
-FOLLOWED = [("forest", 0, 30, ""), ("hill", 0, 30, ""), ("tunnel", 0, 60, "sweeps loose")]
+FOLLOWED = [("forest", 0, 20, ""), ("hill", 0, 20, ""), ("tunnel", 0, 60, "sweeps loose")]
 """Worlds, and the kind of note that a part of the path gets where little tells it (more: benchmarks/lidar.py)."""
 
 

@@ -21,6 +21,7 @@ from synthetic import LIGHT, short_sequence  # noqa: F401 - a fixture
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "writing-a-plugin.md"
 KINDS = {"registration": "o3d_icp", "readers": "npz_folder"}
+PLAIN = "-p", "no:cacheprovider", "-p", "no:dash"
 RUFF = ["check", "--select", "E,F,I,UP,B,SIM,D1"], ["format", "--check"]
 SMALL = (*LIGHT, "fusion=[]", "recording.level=off", "start.relocalise=false")
 
@@ -49,7 +50,7 @@ def packages(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def test_they_pass_their_own_tests_and_the_linter(packages: list[Path]) -> None:
-    done = python(packages[0].parent, packages, "-m", "pytest", "-q", "-p", "no:cacheprovider", *map(str, packages))
+    done = python(packages[0].parent, packages, "-m", "pytest", "-q", *PLAIN, *map(str, packages))
     assert done.returncode == 0, done.stdout
     assert f"{len(packages)} passed" in done.stdout
     for package, command in itertools.product(packages, RUFF):

@@ -6,7 +6,7 @@ import os
 import shutil
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +27,11 @@ from hodge_pipeline.types.notes import Note
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 SMALL = (
-    "clouds.voxel_m=0.06", "fusion=[{stage: cloud}]", "executor.workers=0", "recording.level=summary",
+    "clouds.voxel_m=0.1", "fusion=[{stage: cloud}]", "executor.workers=0", "recording.level=summary",
     "edges.max_edges_per_frame=4", "evaluation.tables=false",
 )  # fmt: skip
 
-SHORT = (
-    "clouds.voxel_m=0.1", "acceptance.min_fitness=0.05", "start.min_fitness=0.05",
-)  # fmt: skip
+SHORT = "acceptance.min_fitness=0.05", "start.min_fitness=0.05"
 
 
 def small_recipe(source: Path, *overrides: str) -> Recipe:
@@ -124,16 +122,15 @@ def test_another_run_gives_the_same_poses_on_any_number_of_workers(short: Run, t
     np.testing.assert_array_equal(other.result.world_from_cam, short.result.world_from_cam)
 
 
-@pytest.mark.parametrize("title", ["odometry", "solve, round 2", "recording"])
-def test_a_run_that_was_stopped_goes_on_where_it_stopped(short: Run, tmp_path: Path, title: str) -> None:
-    recipe = short_recipe(short.source.path)
-    first, second = Log(stop_at=title), Log()
-    with pytest.raises(KeyboardInterrupt):
-        hodge_pipeline.run(recipe, tmp_path / "run", watcher=first)
-    resumed = hodge_pipeline.run(recipe, tmp_path / "run", watcher=second)
-    assert title in (second.stages[0], "recording")
-    done = first.stages[: first.stages.index(title)]
-    assert not set(done) & set(second.stages) - {"recording"}
+def test_a_run_that_was_stopped_again_and_again_goes_on_where_it_stopped(short: Run, tmp_path: Path) -> None:
+    recipe, stopped, done = short_recipe(short.source.path), "", set[str]()
+    for title in ("odometry", "solve, round 2", "recording", ""):
+        log = Log(stop_at=title)
+        with pytest.raises(KeyboardInterrupt) if title else nullcontext():
+            resumed = hodge_pipeline.run(recipe, tmp_path / "run", watcher=log)
+        assert stopped in ("", log.stages[0], "recording")
+        assert not done & set(log.stages) - {"recording"}
+        stopped, done = title, done.union(log.stages[: log.stages.index(title)] if title else ())
     np.testing.assert_array_equal(resumed.result.world_from_cam, short.result.world_from_cam)
 
 

@@ -23,7 +23,7 @@ from mcap_scene import stamp_s, write_clouds, write_rgbd
 from readers_data import points_in_cam
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
-LIGHT = ("clouds.voxel_m=0.06", "executor.workers=0", "recording.level=off", "evaluation.tables=false")
+LIGHT = ("clouds.voxel_m=0.1", "executor.workers=0", "recording.level=off", "evaluation.tables=false")
 
 
 def in_metres(stored: np.ndarray) -> np.ndarray:

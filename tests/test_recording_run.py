@@ -48,28 +48,19 @@ def run(short_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Run: 
     return hodge_pipeline.run(short_recipe(short_sequence, *NORMAL), tmp_path_factory.mktemp("runs") / "short")
 
 
-@pytest.mark.parametrize(
-    ("title", "there", "missing"),
-    [
+def test_a_run_that_was_stopped_again_and_again_leaves_recordings_of_what_was_done(run: Run, tmp_path: Path) -> None:
+    for title, there, missing in (
         ("odometry", layout.CLOUD, layout.poses("odometry")),
         ("registration, round 2", layout.solved_edges(1), layout.edges(2)),
         ("fusion 1", layout.solved_edges(2), layout.MODEL),
-    ],
-)
-def test_a_run_that_was_stopped_leaves_a_recording_of_what_was_done(
-    run: Run,
-    tmp_path: Path,
-    title: str,
-    there: str,
-    missing: str,
-) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        hodge_pipeline.run(short_recipe(run.source.path, *NORMAL), tmp_path / "run", watcher=Log(stop_at=title))
-    verify(tmp_path / "run/recording.rrd", tmp_path)
-    found = entities(tmp_path / "run/recording.rrd")
-    assert there in found and layout.COLOUR in found and layout.RECIPE in found
-    assert missing not in found
-    assert not list((tmp_path / "run").glob(".recording-*"))
+    ):
+        with pytest.raises(KeyboardInterrupt):
+            hodge_pipeline.run(short_recipe(run.source.path, *NORMAL), tmp_path / "run", watcher=Log(stop_at=title))
+        verify(tmp_path / "run/recording.rrd", tmp_path)
+        found = entities(tmp_path / "run/recording.rrd")
+        assert there in found and layout.COLOUR in found and layout.RECIPE in found
+        assert missing not in found
+        assert not list((tmp_path / "run").glob(".recording-*"))
 
 
 def test_a_run_that_failed_leaves_a_recording_and_its_own_error(run: Run, tmp_path: Path) -> None:

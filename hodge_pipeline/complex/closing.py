@@ -32,7 +32,12 @@ def cycle_errors(loops: Loops, i_from_j: Floats) -> tuple[Floats, Floats]:
     """The angle (L,) in radians and the displacement (L,) in metres that the product of motions along each cycle
     leaves, the latter at the middle of the cycle's frames.
     """
-    products, middle = loop_products(loops, i_from_j), _middles(loops, i_from_j)
+    return errors_of_products(loop_products(loops, i_from_j), loops, i_from_j)
+
+
+def errors_of_products(products: Floats, loops: Loops, i_from_j: Floats) -> tuple[Floats, Floats]:
+    """The same where the products (L, 4, 4) are known."""
+    middle = _middles(loops, i_from_j)
     displacement_m = np.einsum("lij,lj->li", products[:, :3, :3], middle) + products[:, :3, 3] - middle
     return np.linalg.norm(se3.so3_log(products[:, :3, :3]), axis=1), np.linalg.norm(displacement_m, axis=1)
 

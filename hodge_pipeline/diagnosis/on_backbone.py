@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.complex.closing import cycle_errors
-from hodge_pipeline.complex.cycles import Loops
+from hodge_pipeline.complex.closing import errors_of_products
+from hodge_pipeline.complex.cycles import Loops, fundamental_products, spanning_forest
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.cycles import WITNESSES, Cycles
 from hodge_pipeline.diagnosis.options import WRONG_BELOW
@@ -75,7 +76,11 @@ def _cycles(graph: ViewGraph, backbone: Backbone, in_loop: Bools) -> tuple[Cycle
     low, high, chords = low[order], high[order], chain.loop_edge[order]
     onward = graph.edges[chords, 0] == chain.order[low]
     loops = _around(graph, chain, chords, low, high, onward)
-    errors = cycle_errors(loops, graph.i_from_j)
+    both = np.concatenate([chain.step_edge[np.append(in_loop, False)[chain.step_edge]], chords])
+    steps = spanning_forest(graph.edges[both[: -len(chords) or None]], graph.vertex_count)
+    forest = replace(steps, edges=graph.edges[both])
+    products = fundamental_products(forest, graph.i_from_j[both], np.arange(len(both) - len(chords), len(both)))
+    errors = errors_of_products(products, loops, graph.i_from_j)
     row = np.full(graph.edge_count, -1, np.int64)
     row[chords] = np.arange(len(chords))
     return Cycles(loops, *errors, backbone.chi2[chords], backbone.used[chords]), row

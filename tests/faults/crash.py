@@ -17,6 +17,8 @@ from hodge_pipeline.uses.recipe_run import solve_again
 
 WRITES = frozenset(("os.rename", "os.remove", "os.rmdir", "os.mkdir", "os.link", "os.truncate", "shutil.rmtree"))
 SEEDED = 60
+EVERY = 1
+"""A folder is kept before every so many writes."""
 _before_write: list[Callable[[str], None]] = []
 
 
@@ -73,7 +75,8 @@ def _snapshots(command: str, scratch: Path) -> list[Path]:
 
         def snapshot(number: int) -> None:
             copy = out / f"{number:04d}"
-            shutil.copytree(folder, copy) if folder.exists() else copy.mkdir()
+            if number % EVERY == 0:
+                shutil.copytree(folder, copy) if folder.exists() else copy.mkdir()
 
         with before_each_write(folder, snapshot):
             go()

@@ -68,7 +68,7 @@ class Testimony:
         """The residuals (K, p), and their covariances (K, p, p), of loops `second` where loops `first` are right."""
         chain, (c, d) = self.chain, self.chain.ends[second].T
         away, covariance = self.beyond(first, c, d)
-        residual = chain.log(se3.inverse(chain.motion[second]) @ se3.inverse(self.linear.poses[c]) @ away)
+        residual = chain.log(chain.between(chain.motion[second], chain.between(self.linear.poses[c], away)))
         return residual, covariance + chain.covariance[second]
 
     def beyond(self, loop: Ints, low: Ints, high: Ints) -> tuple[Floats, Floats]:
@@ -77,7 +77,8 @@ class Testimony:
         """
         chain, poses, total = self.chain, self.linear.poses, self.linear.covariance
         a, b = chain.ends[loop].T
-        end = poses[a] @ chain.motion[loop] @ se3.inverse(poses[b]) @ poses[high]
+        from_end = chain.between(poses[b], poses[high])
+        end = chain.compose(chain.compose(poses[a], chain.motion[loop]), from_end)
 
         def local(frame: Floats, covariance: Floats) -> Floats:
             turned = se3.from_parts(frame[:, :3, :3], np.zeros(3))
@@ -85,7 +86,7 @@ class Testimony:
 
         before = local(end, total[np.maximum(a, low)] - total[np.minimum(a, low)])
         after = local(poses[high], total[np.maximum(b, high)] - total[np.minimum(b, high)])
-        return end, before + after + chain.carried(se3.inverse(poses[high]) @ poses[b], chain.covariance[loop])
+        return end, before + after + chain.carried(se3.inverse(from_end), chain.covariance[loop])
 
     def seeds(self, among: Ints) -> Iterator[tuple[int, Floats]]:
         """Unused loops with which others near them agree most, those of their own place together as one: each differs
@@ -173,7 +174,7 @@ class Usual:
 
     def off(self, chain: Chain, motion: Floats) -> Floats:
         """How far motions (M, 4, 4) are from each kind (K, M, p)."""
-        return chain.log(se3.inverse(self.centres)[:, None] @ motion)
+        return chain.log(chain.between(self.centres[:, None], motion))
 
 
 def _mirrored(chain: Chain, twist: Floats) -> Floats:
@@ -238,7 +239,7 @@ def _fits(told: Testimony, usual: Usual, loop: Ints, at: Ints) -> Floats:
     kind where what is measured is of a kind itself: nothing says that it turned a corner there.
     """
     end, covariance = told.beyond(loop, at - 1, at)
-    off = usual.off(told.chain, se3.inverse(told.linear.poses[at - 1]) @ end)
+    off = usual.off(told.chain, told.chain.between(told.linear.poses[at - 1], end))
     each = np.stack([student(one, covariance + usual.covariance)[0] for one in off])
     each[1:, usual.kind[at]] = -np.inf
     return np.asarray(np.logaddexp.reduce(np.log(usual.shares)[:, None] + each, axis=0))
@@ -251,7 +252,7 @@ def _break(told: Testimony, usual: Usual, loop: int, at: Ints, score: Floats) ->
     row = int(np.argmax(score))
     one = at[row : row + 1]
     end, covariance = told.beyond(np.array([loop]), one - 1, one)
-    off = usual.off(told.chain, se3.inverse(told.linear.poses[one - 1]) @ end)[:, 0]
+    off = usual.off(told.chain, told.chain.between(told.linear.poses[one - 1], end))[:, 0]
     whole = np.broadcast_to(covariance[0] + usual.covariance, (len(off), *covariance.shape[1:]))
     kind = int(np.argmax(np.log(usual.shares) + student(off, whole)[0]))
     chi2 = squares(off, whole)[0][kind]
@@ -296,21 +297,21 @@ class Runs:
     strain: Floats
 
     @classmethod
-    def of(cls, fit: Fit, usual: Usual) -> Runs:
-        """Those of a fit, one at least, with errors as large as the usual run has."""
+    def of(cls, fit: Fit, poses: Floats, usual: Usual) -> Runs:
+        """Those of a fit, one at least, with errors as large as the usual run has; `poses (n, 4, 4)`: the bare ones."""
         chain, used, linear = fit.linear.chain, fit.reduced, fit.linear
         low, high = used.ends[used.runs].T
         residual, total = fit.left_out(used.of_runs)
         chi2, size = student(residual, total)[1], residual.shape[1]
         tense = max(1.0, float(np.median(chi2)) / size)  # as if the steps' scale were too small by the usual run
         log_density, chi2 = student(residual, tense * total)
-        poses, turned = chain.poses, se3.from_parts(linear.poses[high, :3, :3], np.zeros(3))
+        turned = se3.from_parts(linear.poses[high, :3, :3], np.zeros(3))
         ahead = chain.exp((chain.adjoint(se3.inverse(turned)) @ residual[..., None])[..., 0])
         others = replace(
             chain,
             loop_edge=np.full(len(low), -1),
             ends=used.ends[used.runs],
-            motion=se3.inverse(poses[low]) @ poses[high] @ ahead,
+            motion=chain.compose(chain.between(poses[low], poses[high]), ahead),
             covariance=chain.carried(se3.inverse(turned), tense * (total - fit.runs)),
         )
         told = Testimony(others, linearise(others, poses), log_density, np.zeros(len(low)), np.zeros(len(low), bool))

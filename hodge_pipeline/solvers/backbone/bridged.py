@@ -124,7 +124,7 @@ def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
     worth = [(each, least) for each in agreed[:TRIED_AT_ONCE] if each is agreed[0] or each.at != agreed[0].at]
     if len(found.reduced.runs):
-        runs = Runs.of(settled(Fit(found.reduced, found.linear), MOST_STEPS), usual)
+        runs = Runs.of(settled(Fit(found.reduced, found.linear), MOST_STEPS), linear.poses, usual)
         strained, speaks = runs.strained_break(), runs.score(np.array([each.at for each in unlike], np.int64))
         unlike = [each for each, score in zip(unlike, speaks, strict=True) if score > BY_CHANCE]
         if strained is not None and strained.log_evidence > BY_CHANCE:

@@ -141,8 +141,18 @@ class Chain:
 
     def carried(self, poses: Floats, covariance: Floats) -> Floats:
         """Covariances (..., p, p) of twists, in the axes that the poses lead to: `Ad Σ Adᵀ`."""
+        if not self.is_spatial:
+            return plane.carried(poses, covariance)
         into = self.adjoint(poses)
         return np.asarray(into @ covariance @ np.swapaxes(into, -1, -2))
+
+    def compose(self, a: Floats, b: Floats) -> Floats:
+        """Motions `a b` (..., 4, 4)."""
+        return np.asarray(a @ b) if self.is_spatial else plane.compose(a, b)
+
+    def between(self, a: Floats, b: Floats) -> Floats:
+        """Motions `a⁻¹ b` (..., 4, 4)."""
+        return np.asarray(se3.inverse(a) @ b) if self.is_spatial else plane.between(a, b)
 
     def log(self, motions: Floats) -> Floats:
         """Twists (..., p) of the free axes."""

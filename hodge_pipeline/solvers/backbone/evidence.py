@@ -66,7 +66,7 @@ class WrongLoops:
         """Where right loops have such covariances (K, p, p): along an axis in which places hardly differ a wrong loop
         is as far off as a right one.
         """
-        shape = np.maximum(self.spread, ((self.along @ covariance) * self.along).sum(axis=2))
+        shape = np.maximum(self.spread, np.einsum("kij,kij->ki", self.along @ covariance, self.along))
         chi2, size = (self.squared / shape).sum(axis=1), shape.shape[1]
         chi2[self.apart] = size  # how two paths lie is not known
         return np.asarray(log_student(chi2, size, freedom=1.0) - 0.5 * np.log(shape).sum(axis=1))
@@ -90,8 +90,9 @@ def _shape(chain: Chain, poses: Floats, pairs: Ints, rng: np.random.Generator) -
 
 def parallel(chain: Chain, motion: Floats, from_a: Floats, from_b: Floats) -> Floats:
     """Residuals (M, p) of motions between two poses, turned into the world's directions."""
-    left = se3.log(se3.inverse(motion) @ se3.inverse(from_a) @ from_b).reshape(-1, 2, 3)
-    return np.asarray(np.einsum("nij,nkj->nki", from_b[:, :3, :3], left).reshape(-1, 6)[:, chain.axes])
+    turned = se3.from_parts(from_b[:, :3, :3], np.zeros(3))
+    left = chain.log(chain.between(motion, chain.between(from_a, from_b)))
+    return np.asarray(np.einsum("nij,nj->ni", chain.adjoint(turned), left))
 
 
 def squares(residual: Floats, covariance: Floats) -> tuple[Floats, Floats]:

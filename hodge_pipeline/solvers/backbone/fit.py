@@ -78,9 +78,10 @@ def shifted(covariance: Floats, lever: Floats) -> Floats:
 
 def linearise(chain: Chain, poses: Floats) -> Linear:
     """The chain's sums at these poses (n, 4, 4)."""
-    before = np.concatenate([poses[:1], poses[:-1]])
-    left = chain.log(se3.inverse(chain.step) @ se3.inverse(before) @ poses)
-    residual = np.where(chain.inner[:, None], np.einsum("nij,nj->ni", chain.adjoint(poses), left), 0.0)
+    left = chain.log(chain.between(chain.step[1:], chain.between(poses[:-1], poses[1:])))
+    residual = np.zeros((chain.size, len(chain.axes)))
+    residual[1:] = np.einsum("nij,nj->ni", chain.adjoint(poses[1:]), left)
+    residual[~chain.inner] = 0.0
     return Linear(chain, poses, np.cumsum(residual, axis=0))
 
 
@@ -88,7 +89,7 @@ def loops_at(chain: Chain, poses: Floats, rows: Ints) -> tuple[Floats, Floats]:
     """Residuals (K, p) and covariances (K, p, p) of loops, in the world's directions at their later ends."""
     a, b = chain.ends[rows].T
     turned = se3.from_parts(poses[b, :3, :3], np.zeros(3))
-    left = chain.log(se3.inverse(chain.motion[rows]) @ se3.inverse(poses[a]) @ poses[b])
+    left = chain.log(chain.between(chain.motion[rows], chain.between(poses[a], poses[b])))
     return np.einsum("nij,nj->ni", chain.adjoint(turned), left), chain.carried(turned, chain.covariance[rows])
 
 
@@ -132,12 +133,16 @@ class Reduced:
 
     - `ends (R,)`: positions, ascending; `runs (S, 2)`: rows of it; `active (L,)`: rows of the loops.
     - `network`: of the runs and then the loops.
+    - `anchor (n,)`: the row of the end that each position follows, the one before it or else the next; `touched (n,)`:
+      whether its path has one.
     """
 
     ends: Ints
     runs: Ints
     active: Ints
     network: NormalEquations
+    anchor: Ints
+    touched: Bools
 
     @classmethod
     def of(cls, chain: Chain, active: Ints) -> Reduced:
@@ -146,7 +151,8 @@ class Reduced:
         after = np.flatnonzero(chain.path[ends[1:]] == chain.path[ends[:-1]])
         runs = np.stack([after, after + 1], axis=1)
         loops = np.searchsorted(ends, chain.ends[active])
-        return cls(ends, runs, active, NormalEquations.of(np.concatenate([runs, loops]), len(ends)))
+        network = NormalEquations.of(np.concatenate([runs, loops]), len(ends))
+        return cls(ends, runs, active, network, *_anchor(chain, ends))
 
     @property
     def of_runs(self) -> slice:
@@ -171,15 +177,16 @@ class Reduced:
         length = self.ends[self.runs[:, 1]] - self.ends[self.runs[:, 0]]
         return np.asarray(np.cumsum(length) - length)
 
-    def anchor(self, chain: Chain) -> tuple[Ints, Bools]:
-        """The row (n,) of the end that each position follows, the one before it or else the next, and whether its path
-        has one.
-        """
-        where = np.arange(chain.size)
-        right = np.searchsorted(self.ends, where)
-        left, right = np.maximum(right - 1, 0), np.minimum(right, len(self.ends) - 1)
-        has_left = (chain.path[self.ends[left]] == chain.path) & (self.ends[left] <= where)
-        return np.where(has_left, left, right), has_left | (chain.path[self.ends[right]] == chain.path)
+
+def _anchor(chain: Chain, ends: Ints) -> tuple[Ints, Bools]:
+    """See `Reduced`."""
+    where = np.arange(chain.size)
+    if not len(ends):
+        return where, where < 0
+    right = np.searchsorted(ends, where)
+    left, right = np.maximum(right - 1, 0), np.minimum(right, len(ends) - 1)
+    has_left = (chain.path[ends[left]] == chain.path) & (ends[left] <= where)
+    return np.where(has_left, left, right), has_left | (chain.path[ends[right]] == chain.path)
 
 
 def thinned(chain: Chain, rows: Ints) -> Reduced:
@@ -286,44 +293,49 @@ class Fit:
         """The Gauss–Newton move (R, p) of the ends, about the world's origin, and how much of χ² it should win."""
         force = self.force(self.precision @ self.residual[..., None])
         at_ends = self.factor.solve(force)
-        about_origin = np.linalg.inv(self.linear.shift(self.reduced.ends)) @ at_ends
-        return about_origin[..., 0], float((at_ends * force).sum())
+        lever = self.linear.chain.lever(self.linear.poses[self.reduced.ends, :3, 3])
+        return _to_origin(lever, at_ends[..., 0]), float((at_ends * force).sum())
 
     def moved(self, moves: Floats) -> Floats:
         """The poses (n, 4, 4) after a move (R, p) of the loops' ends: runs bend by their covariance, what lies beyond
         the outermost ends follows them rigidly.
         """
-        (first, second), (anchor, touched) = self.reduced.runs.T, self.reduced.anchor(self.linear.chain)
-        out = self._bent(anchor, moves[second] - moves[first]) + moves[anchor]
-        out[~touched] = 0.0
-        return np.asarray(self.linear.chain.exp(out) @ self.linear.poses)
+        chain, (first, second) = self.linear.chain, self.reduced.runs.T
+        out = self._bent(moves[second] - moves[first]) + moves[self.reduced.anchor]
+        out[~self.reduced.touched] = 0.0
+        return chain.compose(chain.exp(out), self.linear.poses)
 
     def between(self, ends: Floats) -> Floats:
         """The poses (n, 4, 4) where the loops' ends have these (R, 4, 4), however far from theirs."""
-        linear, (first, second) = self.linear, self.reduced.runs.T
-        anchor, touched = self.reduced.anchor(linear.chain)
-        move = ends @ se3.inverse(linear.poses[self.reduced.ends])
-        out = self._bent(anchor, linear.chain.log(se3.inverse(move[first]) @ move[second]))
+        linear, (first, second), touched = self.linear, self.reduced.runs.T, self.reduced.touched
+        chain, move = linear.chain, ends @ se3.inverse(linear.poses[self.reduced.ends])
+        out = self._bent(chain.log(chain.between(move[first], move[second])))
         out[~touched] = 0.0
-        moved = linear.chain.exp(out) @ linear.poses
-        moved[touched] = move[anchor[touched]] @ moved[touched]
-        return np.asarray(moved)
+        moved = chain.compose(chain.exp(out), linear.poses)
+        moved[touched] = chain.compose(move[self.reduced.anchor[touched]], moved[touched])
+        return moved
 
-    def _bent(self, anchor: Ints, gap: Floats) -> Floats:
-        """How each position moves (n, p) beside its `anchor (n,)`, the end that it follows, where the second end of
-        each run moves so (S, p) beside its first, about the world's origin.
+    def _bent(self, gap: Floats) -> Floats:
+        """How each position moves (n, p) beside its anchor, the end that it follows, where the second end of each run
+        moves so (S, p) beside its first, about the world's origin.
         """
         reduced, linear = self.reduced, self.linear
         (at, run), (begin, end) = reduced.inside, reduced.ends[reduced.runs].T
-        out = linear.residual[reduced.ends[anchor]] - linear.residual
+        out = linear.residual[reduced.ends[reduced.anchor]] - linear.residual
         gap = gap + linear.residual[end] - linear.residual[begin]
-        pull = self.precision[: len(gap)] @ linear.shift(end) @ gap[..., None]
-        bent = np.concatenate([np.zeros((1, gap.shape[1])), np.cumsum((self.steps @ pull[run])[..., 0], axis=0)])
-        bent = bent[1:] - bent[reduced.first[run]]
-        lever = linear.chain.lever(linear.poses[end, :3, 3])[run]
-        bent[:, -lever.shape[1] :] -= np.einsum("kij,kj->ki", lever, bent[:, : lever.shape[2]])  # back to the origin
-        out[at] += bent
+        pull = (self.precision[: len(gap)] @ linear.shift(end) @ gap[..., None])[..., 0]
+        bent = np.zeros((len(at) + 1, gap.shape[1]))
+        np.cumsum(np.einsum("kij,kj->ki", self.steps, pull[run]), axis=0, out=bent[1:])
+        lever = linear.chain.lever(linear.poses[end, :3, 3])
+        out[at] += _to_origin(lever[run], bent[1:] - bent[reduced.first[run]])
         return out
+
+
+def _to_origin(lever: Floats, twists: Floats) -> Floats:
+    """Twists (K, p) about other origins, about the world's: see `Chain.lever`."""
+    out = twists.copy()
+    out[:, -lever.shape[1] :] -= np.einsum("kij,kj->ki", lever, twists[:, : lever.shape[2]])
+    return out
 
 
 LEAST_WON, HALVINGS = 0.01, 10
@@ -363,7 +375,7 @@ def from_rotations(bare: Fit, steps: int) -> Linear:
     chain, reduced, poses = bare.linear.chain, bare.reduced, bare.linear.poses[bare.reduced.ends]
     first, second = reduced.runs.T
     back = se3.inverse(poses[second])
-    motion = np.concatenate([se3.inverse(poses[first]) @ poses[second], chain.motion[reduced.active]])
+    motion = np.concatenate([chain.between(poses[first], poses[second]), chain.motion[reduced.active]])
     back[:, :3, 3] = 0.0  # the covariances of runs lie along the world's axes
     of_axes = inverse(np.concatenate([chain.carried(back, bare.runs), chain.covariance[reduced.active]]))
     information = np.zeros((len(motion), 6, 6))

@@ -87,16 +87,21 @@ def _between(fit: Fit) -> Floats:
         near.append(nearest)
     component = reduced.network.component
     at = chain.ends[:, 1]
-    for rows in np.split(np.arange(len(gap)), np.arange(BATCH, len(gap), BATCH)):
-        first, second = (linear.carry(reduced.ends[end[rows]], at[rows]) @ samples[end[rows]] for end in near)
-        difference = second - first
-        gap[rows] += difference @ np.swapaxes(difference, 1, 2) / max(SAMPLES - gap.shape[1] - 1, 1)
+    pairs, of_loop = np.unique(np.stack(near), axis=1, return_inverse=True)
+    first, second = reduced.ends[pairs]
+    spread = np.empty((len(first), *gap.shape[1:]))
+    for rows in np.split(np.arange(len(first)), np.arange(BATCH, len(first), BATCH)):
+        moved = linear.carry(first[rows], second[rows]) @ samples[pairs[0, rows]]
+        difference = samples[pairs[1, rows]] - moved
+        spread[rows] = difference @ np.swapaxes(difference, 1, 2) / max(SAMPLES - gap.shape[1] - 1, 1)
+    into = linear.carry(second[of_loop], at)
+    gap += into @ spread[of_loop] @ np.swapaxes(into, 1, 2)
     gap[component[near[0]] != component[near[1]]] = np.inf
     return gap
 
 
 BATCH = 500
-"""Loops whose samples fit in a processor's cache."""
+"""Pairs of ends whose samples fit in a processor's cache."""
 
 
 def _samples(fit: Fit) -> Floats:

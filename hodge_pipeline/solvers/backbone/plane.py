@@ -12,16 +12,34 @@ from hodge_pipeline.types import Floats
 
 def exp(xi: Floats) -> Floats:
     """Motions (..., 4, 4) of twists (..., 3)."""
-    angle = xi[..., 0]
-    half = angle / 2
-    across = np.sin(half) * np.sinc(half / np.pi)  # (1 − cos φ) / φ
-    along = np.sinc(angle / np.pi)  # sin φ / φ
-    out = np.zeros((*xi.shape[:-1], 4, 4))
-    out[..., 0, 0] = out[..., 1, 1] = np.cos(angle)
-    out[..., 1, 0] = np.sin(angle)
-    out[..., 0, 1] = -out[..., 1, 0]
-    out[..., 0, 3] = along * xi[..., 1] - across * xi[..., 2]
-    out[..., 1, 3] = across * xi[..., 1] + along * xi[..., 2]
+    half = xi[..., 0] / 2
+    sine, cosine = np.sin(half), np.cos(half)
+    share = np.divide(sine, half, out=np.ones_like(half), where=half != 0)
+    across, along = sine * share, cosine * share  # (1 − cos φ) / φ, sin φ / φ
+    x, y = along * xi[..., 1] - across * xi[..., 2], across * xi[..., 1] + along * xi[..., 2]
+    return _motions(cosine**2 - sine**2, 2 * sine * cosine, x, y)
+
+
+def compose(a: Floats, b: Floats) -> Floats:
+    """Motions `a b` (..., 4, 4)."""
+    c, s, x, y = a[..., 0, 0], a[..., 1, 0], b[..., 0, 3], b[..., 1, 3]
+    cosine, sine = b[..., 0, 0], b[..., 1, 0]
+    shift_x, shift_y = a[..., 0, 3] + c * x - s * y, a[..., 1, 3] + s * x + c * y
+    return _motions(c * cosine - s * sine, s * cosine + c * sine, shift_x, shift_y)
+
+
+def between(a: Floats, b: Floats) -> Floats:
+    """Motions `a⁻¹ b` (..., 4, 4)."""
+    c, s = a[..., 0, 0], a[..., 1, 0]
+    x, y = b[..., 0, 3] - a[..., 0, 3], b[..., 1, 3] - a[..., 1, 3]
+    cosine, sine = b[..., 0, 0], b[..., 1, 0]
+    return _motions(c * cosine + s * sine, c * sine - s * cosine, c * x + s * y, c * y - s * x)
+
+
+def _motions(cosine: Floats, sine: Floats, x: Floats, y: Floats) -> Floats:
+    out = np.zeros((*x.shape, 4, 4))
+    out[..., 0, 0] = out[..., 1, 1] = cosine
+    out[..., 1, 0], out[..., 0, 1], out[..., 0, 3], out[..., 1, 3] = sine, -sine, x, y
     out[..., 2, 2] = out[..., 3, 3] = 1.0
     return out
 
@@ -42,4 +60,21 @@ def adjoint(motions: Floats) -> Floats:
     out[..., 0, 0] = 1.0
     out[..., 1, 0], out[..., 2, 0] = motions[..., 1, 3], -motions[..., 0, 3]
     out[..., 1:, 1:] = motions[..., :2, :2]
+    return out
+
+
+def carried(motions: Floats, covariance: Floats) -> Floats:
+    """Covariances `Ad Σ Adᵀ` (..., 3, 3)."""
+    c, s, x, y = motions[..., 0, 0], motions[..., 1, 0], motions[..., 1, 3], -motions[..., 0, 3]
+    turn, one, two = covariance[..., 0, 0], covariance[..., 1, 0], covariance[..., 2, 0]
+    xx, xy, yy = covariance[..., 1, 1], covariance[..., 1, 2], covariance[..., 2, 2]
+    one, two = c * one - s * two, s * one + c * two
+    half, mixed = c * xx - s * xy, c * xy - s * yy
+    xx, xy, yy = c * half - s * mixed, s * half + c * mixed, s * (s * xx + c * xy) + c * (s * xy + c * yy)
+    first, second = one + x * turn, two + y * turn
+    out = np.empty((*xx.shape, 3, 3))
+    out[..., 0, 0], out[..., 1, 1], out[..., 2, 2] = turn, xx + x * (one + first), yy + y * (two + second)
+    out[..., 0, 1] = out[..., 1, 0] = first
+    out[..., 0, 2] = out[..., 2, 0] = second
+    out[..., 1, 2] = out[..., 2, 1] = xy + y * one + x * second
     return out
