@@ -28,8 +28,8 @@ from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.refine.pose_graph import disabled_edges
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.diagnosis_page import PageContents, edge_table, frames_table
-from hodge_pipeline.report.diagnosis_plots import side_by_side as pieces_apart
-from hodge_pipeline.report.edge_pictures import BLUE, ORANGE, _exaggeration, _views, side_by_side
+from hodge_pipeline.report.diagnosis_plots import pieces_apart
+from hodge_pipeline.report.edge_pictures import BLUE, ORANGE, _exaggeration, _views, draw_matches
 from hodge_pipeline.report.energy import energy_rows
 from hodge_pipeline.types import Edges, PointCloud, ViewGraph
 from hodge_pipeline.types.text import number_of, with_symbols
@@ -128,7 +128,7 @@ def test_many_wrong_edges_are_left_out_by_one_short_command(tmp_path: Path, monk
     CliRunner().invoke(app, [*told.split()[2:], "--run", "solved"], catch_exceptions=False)
     again = diagnose_subject(open_subject(Path("solved")))
     assert "The robust solve left 4 of the wrong edges out already." in again.notes and again.commands == ()
-    assert [again.advice[row] for row in (3, 17, 30, 41)] == ["nothing: no pose hangs on it"] * 4
+    assert [again.advice[row] for row in (3, 17, 30, 41)] == ["nothing: no pose depends on it"] * 4
 
 
 def test_the_wrong_edges_of_a_run_are_disabled_by_one_word_or_not_at_all(
@@ -147,7 +147,8 @@ def test_the_wrong_edges_of_a_run_are_disabled_by_one_word_or_not_at_all(
     assert otherwise.commands[0].endswith(f"--disable {i}-{j}")
     as_good = diagnose_subject(replace(judged, harmless="No pose moves: nothing to do."))
     assert not any("disable" in command for command in as_good.commands)
-    assert as_good.advice[17] == "nothing: no pose hangs on it" and as_good.notes[0] == "No pose moves: nothing to do."
+    assert as_good.advice[17] == "nothing: no pose depends on it"
+    assert as_good.notes[0] == "No pose moves: nothing to do."
 
 
 def test_the_files_say_the_same(wrong_edge: tuple[Path, str, ViewGraph]) -> None:
@@ -338,10 +339,10 @@ def test_a_small_offset_is_enlarged_until_it_is_seen() -> None:
 def test_an_image_matches_itself_and_nothing_else() -> None:
     rng = np.random.default_rng(0)
     image = np.kron(rng.integers(0, 255, (40, 52, 3), np.uint8), np.ones((8, 8, 1), np.uint8)).astype(np.uint8)
-    same, other = side_by_side(image, image), side_by_side(image, np.full_like(image, 90))
+    same, other = draw_matches(image, image), draw_matches(image, np.full_like(image, 90))
     assert same.agreeing > 50 and same.agreeing == same.matches
     assert (other.matches, other.agreeing) == (0, 0)
-    np.testing.assert_array_equal(side_by_side(image, image).image, same.image)
+    np.testing.assert_array_equal(draw_matches(image, image).image, same.image)
 
 
 def test_a_run_is_diagnosed_with_pictures(tiny_sequence: Path, tmp_path: Path) -> None:  # noqa: F811

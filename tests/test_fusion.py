@@ -130,7 +130,7 @@ def test_frames_that_cannot_be_used_are_counted(fuser: TsdfFuser | CloudFuser) -
     done: list[int] = []
     model = fuser.fuse(frames, poses, done.append)
     assert sum(done) == 8
-    assert model.notes[0] == "1 frame skipped: nothing says where it is (the first: 2)"
+    assert model.notes[0] == "1 frame skipped: its pose is unknown (the first: 2)"
     bare, unread = sorted(model.notes[1:])
     assert unread == "2 frames skipped: cannot be read (the first: 4: x.png: cut short)"
     assert bare.startswith("1 frame skipped: ") and bare.endswith("(the first: bare)")

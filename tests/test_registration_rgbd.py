@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.descriptors import match, root_sift
-from hodge_pipeline.registration.landmarks import back_projected, find_landmarks
+from hodge_pipeline.registration.landmarks import find_landmarks
+from hodge_pipeline.registration.resection import back_project
 from hodge_pipeline.registration.rgbd import Rgbd, guided_match
 from hodge_pipeline.registration.visual import VisualMotion, fit_triples, visual_motion
 from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats, Floats32, Frame, Landmarks, PointCloud
@@ -117,9 +118,7 @@ def test_a_frame_without_image_depth_or_camera_has_no_landmark(lost: str):
 
 
 def test_back_projection_is_the_inverse_of_the_camera():
-    points = back_projected(
-        np.array([[319.5, 239.5], [319.5 + 525, 239.5]], np.float32), np.array([2.0, 3.0], np.float32), CAMERA
-    )
+    points = back_project(np.array([[319.5, 239.5, 2.0], [319.5 + 525, 239.5, 3.0]]), CAMERA)
     np.testing.assert_allclose(points, [[0, 0, 2], [3, 0, 3]], atol=1e-6)
 
 

@@ -39,7 +39,7 @@ from hodge_pipeline.start import odometry as odometry_start
 from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.key_frames import KeyFrameStart, Tracked, followers
 from hodge_pipeline.start.odometry import OdometryStart
-from hodge_pipeline.start.unordered.join import _stays
+from hodge_pipeline.start.unordered.join import _keeps_odometry
 from hodge_pipeline.start.unordered.start import Start
 from hodge_pipeline.store.store import Store, stored
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Source, ViewGraph
@@ -390,9 +390,9 @@ def test_parts_that_nothing_joins_stay_where_they_are_guessed_to_be_unless_over_
     apart = Start(poses, known, np.array([0, 0, 1, 1]), ())
     joined = Start(poses, known, np.zeros(4, np.int64), ())
     steady, hole = source_at([0, 1, 2, 3]), source_at([0, 1, 2, 30])
-    assert _stays(steady, known, apart)
-    assert not _stays(steady, known, joined)
-    assert not _stays(hole, known, apart)
+    assert _keeps_odometry(steady, known, apart)
+    assert not _keeps_odometry(steady, known, joined)
+    assert not _keeps_odometry(hole, known, apart)
 
 
 @pytest.mark.parametrize("earlier", [False, True])

@@ -66,7 +66,7 @@ class InProcess:
 
 
 class SpawnedWorkers:
-    """A pool of processes that is mended when one of them dies."""
+    """A pool of processes that is replaced when one of them dies."""
 
     def __init__(self, count: int, retries: int) -> None:
         self._count, self._retries = count, retries
@@ -98,7 +98,7 @@ class SpawnedWorkers:
                 waiting += sorted(lost, reverse=True)
 
     def _may_begin(self, row: int, running: list[int], tries: list[int]) -> bool:
-        """No more blocks than the pool has hands for; one lost before runs alone, so its next death is its own."""
+        """Whether to submit: up to two blocks a worker, but one whose worker died alone, to know which block kills."""
         return not running or (len(running) < 2 * self._count and not any(tries[other] for other in (row, *running)))
 
     def _recover(self, lost: list[int], tries: list[int]) -> None:
@@ -159,7 +159,7 @@ def _exit_after(sentinel: int) -> None:
 
 
 def _refuse_main(task: Callable[[Task], Result], blocks: Sequence[Task]) -> None:
-    """One clear line for what a worker could not load, since it never runs the user's script."""
+    """Raise `WorkerError` for a task defined in `__main__`, which a worker, not running the script, cannot load."""
     if blocks and b"__main__" in pickle.dumps((task, blocks[0])):
         raise WorkerError(
             "a stage or function is defined in the script or notebook itself, which workers do not load: "

@@ -14,25 +14,25 @@ from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Ints
 
 BLOCK_SIDE = 8
 VALUES = {"tsdf": 1, "weight": 1, "color": 3}
-"""Of a voxel, open3d's names, and how many numbers each is."""
+"""Attributes of a voxel by open3d's names, with the number of channels."""
 BYTES_A_VOXEL = 4 + 4 + 12 + 16
-"""Distance, weight, colour, and the vertex index that the extraction adds."""
+"""Distance, weight, colour, and the vertex index that the mesh extraction adds."""
 GROWTH_COPIES = 3
-"""The old blocks are alive while the twice as many new ones are filled."""
+"""Memory while the grid doubles, in sizes of the old one: the old blocks and twice as many new ones."""
 FIRST_BLOCKS = 8000
 GREY = 128
-"""Of a voxel without a colour in a block without any."""
-SEEN = 1
-"""Added to the colours in a grid, so that black is not what no image has coloured: 0."""
-STORED = 255.0
+"""Grey level of voxels in a block that no image has coloured."""
+COLOUR_OFFSET = 1
+"""Added to colours in the grid, so that 0 means no colour and not black."""
+COLOUR_SCALE = 255.0
 """By which open3d multiplies the colours of a float image in a grid, and divides those of a mesh."""
 BLOCKS_AT_ONCE = 1000
 TOUCH_STRIDE = 4
-"""Of a depth image open3d takes each fourth row and column to find the blocks that it touches."""
+"""open3d samples every fourth row and column of a depth image to find the blocks that it touches."""
 
 
 class GridFull(Exception):
-    """The next frame would take the grid past its bound. Internal: the fuser starts again, box by box."""
+    """The next frame would take the grid past `max_blocks`: the fuser starts again, box by box."""
 
 
 def blocks_within(memory_limit_mb: float) -> int:
@@ -41,15 +41,15 @@ def blocks_within(memory_limit_mb: float) -> int:
 
 
 TRUNCATION_VOXELS = 4.0
-"""How far from the surface a distance is kept; must exceed depth noise and drift."""
+"""Truncation distance in voxels; must exceed depth noise and drift."""
 
 
 class BlockGrid:
-    """Integrates depth images; `max_blocks` bounds it, `GridFull` is raised before it is passed.
+    """A TSDF of at most `max_blocks` blocks, with colours if `colour`; `GridFull` is raised before it grows larger.
 
-    It holds colours or, without `colour`, none; `views` were added, `coloured` of them with an image, which must come
-    first: open3d counts all views of a voxel as if they had coloured it.
-    Of a `box` it holds the blocks in it and those around them, which the surface at its faces needs.
+    `views` counts the views added, `coloured` those of them with an image, which must come first: open3d divides the
+    colour of a voxel by all its views. With a `box` it holds only the blocks in the box and those next to it, which the
+    surface at its faces needs.
     """
 
     def __init__(
@@ -63,15 +63,15 @@ class BlockGrid:
         self.max_depth_m, self.max_blocks = max_depth_m, max_blocks
         self.voxel_m, self.box = voxel_m, box
         self.colour, self.views, self.coloured = colour, 0, 0
-        self._grid = self._of(min(FIRST_BLOCKS, max_blocks))
+        self._grid = self._empty(min(FIRST_BLOCKS, max_blocks))
 
     def __len__(self) -> int:
         return int(self._grid.hashmap().size())
 
     def integrate(self, depth_m: Floats32, colour: Bytes | None, camera: Camera, world_from_cam: Floats) -> bool:
-        """Add one view: depth (H, W), 0 where there is none; colour (h, w, 3) of the same field of view, or none.
+        """Add one view: depth (H, W) in metres, 0 where there is none; colour (h, w, 3) of the same field of view.
 
-        False where no depth is within reach: there was nothing to add.
+        False where no depth is within `max_depth_m`. Raises `GridFull`.
         """
         if not self._reaches(depth_m):
             return False
@@ -88,7 +88,7 @@ class BlockGrid:
         if not self.colour or colour is None:
             self._grid.integrate(blocks, depth, matrix, pose, 1.0, *reach)
         else:
-            image = o3d.t.geometry.Image(_tensor(np.add(colour, SEEN, dtype=np.float32), np.float32))
+            image = o3d.t.geometry.Image(_tensor(np.add(colour, COLOUR_OFFSET, dtype=np.float32), np.float32))
             colour_matrix = _floor_matrix(camera, depth_m.shape, colour.shape)
             self._grid.integrate(blocks, depth, image, matrix, colour_matrix, pose, 1.0, *reach)
         return True
@@ -124,7 +124,7 @@ class BlockGrid:
         old, capacity = self._grid, int(self._grid.hashmap().capacity())
         if needed <= capacity:
             return
-        self._grid = self._of(min(max(needed, 2 * capacity), self.max_blocks))
+        self._grid = self._empty(min(max(needed, 2 * capacity), self.max_blocks))
         rows = old.hashmap().active_buf_indices().to(o3d.core.int64)
         new_rows, _ = self._grid.hashmap().activate(old.hashmap().key_tensor()[rows])
         for name in VALUES:  # open3d's own reserve takes a millisecond a block
@@ -132,7 +132,7 @@ class BlockGrid:
             for row, new_row in zip(rows.numpy().tolist(), new_rows.numpy().tolist(), strict=True):
                 new_values[new_row] = values[row]
 
-    def _of(self, blocks: int) -> Any:
+    def _empty(self, blocks: int) -> Any:
         """An empty grid with room for so many blocks."""
         return o3d.t.geometry.VoxelBlockGrid(
             attr_names=tuple(VALUES),
@@ -144,14 +144,14 @@ class BlockGrid:
         )
 
     def mesh(self, min_weight: float) -> Mesh:
-        """The surface seen more than `min_weight` times, of a box the part of it that lies inside."""
+        """The surface seen more than `min_weight` times; with a box, its part inside the box."""
         if len(self) == 0:
             return Mesh.joined([])
         if self.colour:
             self._colour_the_rest()
         raw = self._grid.extract_triangle_mesh(min_weight)
         points, normals = raw.vertex.positions.numpy(), raw.vertex.normals.numpy()
-        colours = np.rint(np.clip(raw.vertex.colors.numpy() - SEEN, 0, 255)).astype(np.uint8)
+        colours = np.rint(np.clip(raw.vertex.colors.numpy() - COLOUR_OFFSET, 0, 255)).astype(np.uint8)
         mesh = Mesh(points, normals, colours, raw.triangle.indices.numpy())
         if self.box is not None:
             middles = points[mesh.triangles].mean(axis=1, dtype=float)
@@ -168,7 +168,7 @@ class BlockGrid:
             for block in np.flatnonzero(bare.any(axis=(1, 2, 3))).tolist():
                 own = colours[part[block]]
                 known = own[coloured[block]]
-                own[bare[block]] = known.mean(axis=0) if len(known) else STORED * (GREY + SEEN)
+                own[bare[block]] = known.mean(axis=0) if len(known) else COLOUR_SCALE * (GREY + COLOUR_OFFSET)
 
 
 def _tensor(values: Any, kind: Any) -> Any:

@@ -1,4 +1,4 @@
-"""A scene cut into boxes of blocks, each of which a grid within its bound of memory holds."""
+"""A scene cut into boxes of voxel blocks that fit into memory."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Box:
 
 
 def boxes_of(blocks: Ints, most: int) -> Iterator[Box]:
-    """Boxes that hold all blocks (M, 3) once, none with more than `most` in and around it if it can be cut."""
+    """Boxes that hold each of the blocks (M, 3) once, with at most `most` in and next to each that can still be cut."""
     if not len(blocks):
         return
     low, high = blocks.min(axis=0), blocks.max(axis=0) + 1

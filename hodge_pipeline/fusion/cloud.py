@@ -19,13 +19,15 @@ from hodge_pipeline.types.text import counted
 POINTS_AT_ONCE = 1 << 20
 
 MAX_STEP = 0.05
-"""Share of the depth: a larger step between neighbouring pixels is an edge of an object, which has no normal."""
+"""Share of the depth: a larger step between neighbouring pixels is an occlusion edge, which has no normal."""
 
 AXIS_BITS = 21
+"""Of a voxel's index along each axis: three of them are packed into one 64-bit key."""
 HALF = 1 << (AXIS_BITS - 1)
 MERGE_AT = 1_000_000
-"""Rows that wait before they are merged: a merge sorts all voxels, so it must be rare."""
+"""Rows collected between two merges: each sorts all voxels."""
 POSITION, COLOUR, NORMAL, COUNT = slice(0, 3), slice(3, 6), slice(6, 9), 9
+"""Columns of the sums."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

@@ -1,4 +1,4 @@
-"""A mesh in an order of its own, and one of many that meet."""
+"""Triangle meshes with sorted vertices, and the join of meshes that meet."""
 
 from __future__ import annotations
 

@@ -18,24 +18,23 @@ from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types import Floats, Frame, Ints, Model
 
 BYTES_A_VERTEX = 150
-"""Place, normal, colour and two triangles, thrice while they are put into order."""
+"""Position, normal, colour and two triangles, three times over while the mesh is sorted."""
 MOST_BETWEEN, FEWEST_COLOURED = 3, 30
-"""Views from one whose colours are taken to the next, and how many are taken at least: colours are half of the cost of
-a view, and show the same."""
+"""Every third view is fused with colour, more of fewer than 90: colour is half of the cost of a view."""
 Views: TypeAlias = list[tuple[Frame, Floats, bool]]
-"""Frame, pose, and whether its colours are taken."""
+"""Frame, pose, and whether it is fused with colour."""
 _Made: TypeAlias = tuple[Mesh, float, bool]
-"""A mesh, the weight that its surface needed, and whether any view had colours."""
+"""A mesh, the `min_weight` that it was extracted with, and whether any view had colour."""
 
 
 class _Progress:
-    """Tells how many views were looked at, each once, however often they are looked at."""
+    """Reports each view once, however often the passes over the views read it."""
 
     def __init__(self, advance: Advance) -> None:
         self._advance, self.told = advance, 0
 
     def reached(self, views: int) -> None:
-        """So many views, the first ones, were looked at by now."""
+        """The first `views` of them have been read."""
         if views > self.told:
             self._advance(views - self.told)
             self.told = views
@@ -103,7 +102,7 @@ class TsdfFuser:
         )
 
     def _made(self, views: Views, voxel_m: float, skipped: Skipped, progress: _Progress) -> _Made | None:
-        """The mesh; None where it would pass the limit. A scene that one grid cannot hold is fused box by box."""
+        """The mesh, fused box by box where one grid cannot hold it; None where it would exceed the memory limit."""
         grid = self._grid(voxel_m, views, None)
         try:
             self._integrate(grid, views, skipped, progress)
@@ -113,7 +112,7 @@ class TsdfFuser:
         return grid.mesh(min_weight), min_weight, grid.coloured > 0
 
     def _made_in_boxes(self, views: Views, voxel_m: float, skipped: Skipped, progress: _Progress) -> _Made | None:
-        """The same mesh, of boxes of space one after the other, each from the views that see it."""
+        """The mesh as of `_made`, from boxes of space one after the other, each fused from the views that see it."""
         blocks, spans = self._touched(self._grid(voxel_m, views, None), views, skipped, progress)
         min_weight = self._min_weight(int((spans[:, 0] <= spans[:, 1]).all(axis=1).sum()))
         parts, vertices, coloured = [], 0, False
@@ -136,7 +135,7 @@ class TsdfFuser:
         return BlockGrid(voxel_m, self.max_depth_m, limit, colour, box)
 
     def _touched(self, grid: BlockGrid, views: Views, skipped: Skipped, progress: _Progress) -> tuple[Ints, Ints]:
-        """All blocks (M, 3), and each view's least and largest one (V, 2, 3), of one that has none the other way."""
+        """All blocks (M, 3), and each view's least and largest block (V, 2, 3), least above largest if it has none."""
         blocks: set[tuple[int, int, int]] = set()
         spans = np.broadcast_to(np.array([[1, 1, 1], [0, 0, 0]]), (len(views), 2, 3)).copy()
         for row, (frame, pose, _) in enumerate(views):
@@ -150,12 +149,12 @@ class TsdfFuser:
 
     def _integrate(self, grid: BlockGrid, views: Views, skipped: Skipped, progress: _Progress) -> None:
         views = list(views)
-        for row, (frame, pose, is_coloured) in enumerate(views):  # which grows
+        for row, (frame, pose, is_coloured) in enumerate(views):  # grows, see below
             if frame.camera is None or frame.read_depth is None:
                 skipped.add("no depth image", frame)
                 continue
             colour = skipped.colour(frame) if grid.colour and is_coloured else None
-            if grid.colour and is_coloured and colour is None:  # after those that have one
+            if grid.colour and is_coloured and colour is None:  # it must come after those with colour
                 views.append((frame, pose, False))
                 continue
             with skipped.unreadable(frame):
@@ -182,7 +181,7 @@ class TsdfFuser:
 
 
 def _coloured_first(posed_frames: list[tuple[Frame, Floats]]) -> Views:
-    """The frames whose colours are taken, evenly spread, before the others, as a `BlockGrid` wants them."""
+    """The views with those fused with colour, evenly spread, before the others, as `BlockGrid` needs them."""
     step = min(MOST_BETWEEN, max(1, len(posed_frames) // FEWEST_COLOURED))
     views = [(frame, pose, row % step == 0) for row, (frame, pose) in enumerate(posed_frames)]
     return sorted(views, key=lambda view: not view[2])

@@ -1,4 +1,4 @@
-"""What every fuser shares: which frames it takes, and what it says about those that it leaves out, or their colours."""
+"""Shared by all fusers: the choice of frames, and notes on frames left out or fused without colour."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def posed(
     taken: list[tuple[Frame, Floats]] = []
     for frame, pose in zip(frames[::every], world_from_cam[::every], strict=True):
         if not np.isfinite(pose).all():
-            skipped.add("nothing says where it is", frame)
+            skipped.add("its pose is unknown", frame)
         elif not taken or min_motion_m == 0 or _moved_m(taken[-1][1], pose) >= min_motion_m:
             taken.append((frame, pose))
     return taken

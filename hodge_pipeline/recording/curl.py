@@ -19,7 +19,7 @@ from hodge_pipeline.types.text import markdown_table
 
 MOST_TRIANGLES = 20_000
 OPEN_CHI = 30.0**0.5
-"""Of the curl: a cycle whose χ² exceeds its square does not close; the colours end there."""
+"""√χ² of a cycle above which it does not close, and at which the colours end."""
 ALPHA = 110
 TRIANGLE_BYTES = 60
 

@@ -34,7 +34,7 @@ class Eye:
 
 @dataclass(frozen=True)
 class Eyes:
-    """Where the model, the graph alone, and the clouds of a pair in the axes of the first are looked at from."""
+    """Viewpoints of the model, of the graph without it, and of the clouds of a pair in the axes of the first."""
 
     room: Eye | None = None
     graph: Eye | None = None

@@ -25,8 +25,8 @@ POINT_BYTES = 16
 MOST_POINTS = 300_000
 """Of all frames' clouds together; more says little beside the fused model."""
 SIZED_FRAMES, MARGIN = 16, 1.1
-"""Frames whose images are read to know how large all are, and what their mean is taken times: of red kitchen's frames
-the largest is 1.2 times the mean, and the mean of 16 is known to 3 %."""
+"""Frames whose images are read to estimate the size of all, and the safety factor on their mean: of red kitchen's
+frames the largest is 1.2 times the mean, and the mean of 16 is known to 3 %."""
 
 
 def log_frames(part: Part, name: str, frames: Sequence[Frame], notes: Sequence[str]) -> None:
@@ -63,7 +63,7 @@ def image_rows(frames: Sequence[Frame], options: RecordingOptions) -> tuple[Ints
 
 
 def _sized_once(frames: Sequence[Frame]) -> list[Frame]:
-    """The frames; those that tell the size of all images keep theirs, to be logged without being encoded anew."""
+    """The frames; those that `_sizes` reads keep their encoded images, so that these are encoded only once."""
     kept = list(frames)
     for row in evenly(len(frames), SIZED_FRAMES):
         depth, colour = kept[row].encoded_depth, kept[row].encoded_colour
@@ -74,8 +74,8 @@ def _sized_once(frames: Sequence[Frame]) -> list[Frame]:
 
 
 def _sizes(frames: Sequence[Frame]) -> Floats:
-    """Bytes (N,) of the frames' images; of many frames the mean of some for each, since an image that is bent straight
-    is encoded anew each time, with a margin.
+    """Bytes (N,) of the frames' images; of many frames the mean of a few, with a margin, since an undistorted image is
+    encoded again each time.
     """
     some = [sum(len(image.contents) for image in _images(frames[row])) for row in evenly(len(frames), SIZED_FRAMES)]
     if len(some) == len(frames):

@@ -16,14 +16,14 @@ STEPS = 24
 MOST_POINTS = 120_000
 POINT_BYTES = 16
 USUAL_GRID_M = 0.03
-"""Of a recipe for rooms."""
+"""Distance between the points of a cloud, by the recipes for rooms."""
 GRIDS = 2.0
-"""A cell in grids of the clouds: a fused point and the measured one beside it are in the same or the next cell."""
+"""Side of a cell, in distances between points: a fused point and its measured neighbour are in the same or the next."""
 POINT_RADIUS = -1.2
 
 
 def log_growth(part: Part, model: Model, clouds: CloudSet, world_from_cam: Floats, slot: int) -> None:
-    """Log the model's points in `STEPS` entities, each of which appears with its first frame in a slot of the story."""
+    """Log the model's points in `STEPS` entities, each from the time on at which its first frame saw it."""
     stream, options = part.stream, part.options
     kept = options.count(MOST_POINTS, len(model.points_in_world), POINT_BYTES, options.max_bytes("model") / 2)
     rows = evenly(len(model.points_in_world), min(kept, MOST_POINTS))
@@ -45,10 +45,7 @@ def log_growth(part: Part, model: Model, clouds: CloudSet, world_from_cam: Float
 
 
 def first_frame(points: Floats32, clouds: CloudSet, world_from_cam: Floats) -> Ints:
-    """The row of the first frame whose cloud reaches the cell of each point (P,) or one beside it; else the last.
-
-    Memory holds the cells of the points and one cloud.
-    """
+    """The first row whose cloud has a point in the cell of each point (P,), or in one beside it; else the last row."""
     found = np.full(len(points), len(clouds) - 1)
     known = np.flatnonzero(se3.has_pose(world_from_cam) & (clouds.sizes > 0))
     if not len(points) or not len(known):
@@ -70,7 +67,7 @@ def first_frame(points: Floats32, clouds: CloudSet, world_from_cam: Floats) -> I
 
 
 def grid_m(points: Floats) -> float:
-    """The distance between neighbours in a cloud (P, 3): that of the median point; the usual one of a single point."""
+    """The median distance to the nearest neighbour in a cloud (P, 3); `USUAL_GRID_M` for a single point."""
     if len(points) < 2:
         return USUAL_GRID_M
     return max(float(np.median(cKDTree(points).query(points, k=2)[0][:, 1])), float(np.finfo(np.float32).eps))

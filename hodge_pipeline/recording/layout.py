@@ -144,5 +144,5 @@ def parse_part(file_name: str) -> tuple[str, str]:
 
 
 def outer_number(outer: int, offset: int) -> int:
-    """The part number of stage `offset` in outer round 1, 2, …"""
+    """The part number of stage `offset` in outer round 1, 2, …: below 890, the diagnosis' in `Recorder`."""
     return min(10 * outer, 880) + offset

@@ -18,7 +18,7 @@ LOOP_RADIUS = -2.2
 LOOP_COLOURS = np.array([[255, 255, 255], [230, 60, 160]], float)
 MOST_NAMED = 12
 BRIGHT_MEDIANS = 4.0
-"""Medians of the loops' errors at which their colours end: the worst stand out, whatever the scene's size."""
+"""Error at which the colours end, in medians of all loops: the worst stand out, whatever the scene's size."""
 
 
 def log_loops(part: Part, graph: ViewGraph, world_from_cam: Floats) -> None:

@@ -62,7 +62,7 @@ def with_entities(contents: Contents, readers: Collection[RrdReader]) -> Content
 
 
 def eyes(contents: Contents, readers: Collection[RrdReader]) -> Eyes:
-    """Where the views of these parts are looked at from."""
+    """The initial viewpoints of these parts."""
     poses, is_scanner = layout.poses(contents.trajectory), contents.is_scanner
     pairs = points_of(_chunks(readers, f"{layout.PAIRS}/**"))
     return Eyes(

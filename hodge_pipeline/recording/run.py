@@ -41,8 +41,8 @@ class Recording:
     """The recording of a run in progress: a context that ends with `recording.rrd` in the run folder.
 
     Each method records one part, as a step of its own: a resumed run records only what it computes again. Where the run
-    is stopped or fails, what was recorded so far is merged and the error goes on; before `begin` that is the whole
-    `source`. With the level `off` nothing is written.
+    is stopped or fails, the parts so far are merged and the error goes on; before `begin` these are the frames of
+    `source` with their clouds, if made. With the level `off` nothing is written.
     """
 
     def __init__(self, steps: Steps, folder: Path, recipe: Recipe, source: Source, live: str | None = None) -> None:
@@ -70,13 +70,13 @@ class Recording:
 
     def begin(self, source: Source, clouds: CloudSet, first: Round) -> None:
         """The frames that are registered, their clouds, and the poses that the run starts from."""
-        self._seen(source, clouds)
+        self._record_frames(source, clouds)
         self._rounds, frames = [first], source.frames
         name, poses = first.name, first.world_from_cam
         name = FIRST if name == START and has_given(source) else name
         self._part("first_poses", (self._source, name, poses), lambda to: to.poses(name, poses, frames))
 
-    def _seen(self, source: Source, clouds: CloudSet | None) -> None:
+    def _record_frames(self, source: Source, clouds: CloudSet | None) -> None:
         self._source, self._clouds, frames = source, clouds, source.frames
         self._part("frames", (source,), lambda to: to.frames(source.name, frames, source.notes))
         if clouds is not None:
@@ -113,7 +113,7 @@ class Recording:
         self._part("evaluation", inputs, lambda to: _record_evaluation(to, self._source, rounds, scores))
 
     def models(self, models: Mapping[str, Path]) -> None:
-        """The fused models; of several the last is seen."""
+        """The fused models; of several the viewer shows the last."""
         assert self._clouds is not None
         clouds, poses = self._clouds, self._rounds[-1].world_from_cam
         if models:
@@ -146,19 +146,19 @@ class Recording:
         artifacts.link_or_copy(merged, self._folder / FILE)
 
     def _rescue(self) -> None:
-        """Merge what there is; an error of this is logged, so that the one that stopped the run is seen."""
+        """Merge the parts so far; an error is only logged, so that the one that stopped the run is raised."""
         try:
             if not self._parts:
                 whole = len(self._source.frames)
                 made = [found for found in stored(self._folder / RUN, clouds_step) if len(found) == whole]
-                self._seen(self._source, made[-1] if made else None)
+                self._record_frames(self._source, made[-1] if made else None)
             with tempfile.TemporaryDirectory(dir=self._folder, prefix=".recording-") as scratch:
                 self._merge(Path(scratch), self._folder / FILE)
         except Exception as error:
             log.warning("the recording could not be merged: %s", error)
 
     def _merge(self, folder: Path, out: Path) -> Notes:
-        """True and given poses, recipe and log, which belong to the run as a whole, then all parts as one file."""
+        """Write all parts into `out`, with true and given poses, recipe and log; the notes of these."""
         recorder = self._recorder(folder)
         notes = _record_reference(recorder, self._source, self._rounds)
         lines = read_input_text(self._folder / "log.txt", errors="replace").splitlines()

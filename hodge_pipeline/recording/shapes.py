@@ -15,30 +15,30 @@ IGNORED_COLOUR = (230, 60, 160)
 REJECTED_COLOUR = (110, 110, 110)
 RESULT_COLOUR = (255, 255, 255)
 GREY = 190
-"""Of points without a colour."""
+"""Grey level of points without a colour."""
 TRAJECTORY_COLOURS = {
     "truth": (0, 200, 140), "odometry": (230, 130, 0), "start": (185, 130, 235), "a": (230, 130, 0), "b": (86, 180, 233)
 }  # fmt: skip
 """Bluish green, orange, purple, sky blue of Okabe and Ito's colour-blind safe set, brightened for a dark background."""
 
 MOST_LINES = 20_000
-"""In one picture of the graph; more is a solid block."""
+"""Lines in one picture of the graph: more is a solid block."""
 LEAST_POSE_M, POSE_SHARE = 0.06, 0.02
-"""How large a pose is drawn: in a room, and of the extent of its trajectory where that is more."""
+"""Size of a drawn pose: metres at least, and a share of its trajectory's extent."""
 _CORNERS = np.array([[-0.8, -0.6, 1.0], [0.8, -0.6, 1.0], [0.8, 0.6, 1.0], [-0.8, 0.6, 1.0]])
 _FRUSTUM = np.vstack([_CORNERS, np.zeros((1, 3))])[[0, 4, 1, 2, 4, 3, 0, 1, 2, 3]]
 _ARROW = np.array([[0, 0, 0.5], [0, 0, 0], [1, 0, 0], [0.7, 0.2, 0], [0.7, -0.2, 0], [1, 0, 0]])
 SCANNER_AXES = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 """Right, down and ahead of a scanner, or a robot, in its own axes: x ahead and z up; a camera's are the unit matrix."""
 LOOKED_AT = 9
-"""Clouds that tell whether they are a scanner's: all are of one sensor."""
+"""Clouds tested by `is_scanner`: all are of one sensor."""
 SEEN_BEHIND = 0.01
-"""Share of points behind the image plane, which no camera has: of those of a scanner, whose z is up, it is the ground.
+"""Share of points with z < 0, which no camera has, above which the clouds are a scanner's: with z up, it is the ground.
 """
 
 
 def is_scanner(clouds: CloudSet, rows: Ints | None = None) -> bool:
-    """Whether these rows, or a few of them, hold points behind an image plane."""
+    """Whether the clouds of these rows, by a few of them, are a scanner's: with points at z < 0."""
     rows = np.flatnonzero(clouds.sizes > 0) if rows is None else rows
     looked_at = rows[evenly(len(rows), LOOKED_AT)].tolist()
     return len(rows) > 0 and bool(

@@ -23,7 +23,7 @@ from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.output_files import draft_of
 
 APPLICATION = "hodge-pipeline"
-"""By which the viewer keeps a layout that the user has changed."""
+"""Application id, under which the viewer stores a layout that the user has changed."""
 TURN_S, STALLED_S = 2.0, 60.0
 """How long Rerun is waited for at a time, and after how long without a byte its writer counts as dead."""
 LEAST_FREE_BYTES = 1 << 16

@@ -15,11 +15,11 @@ CONTRADICTS = "contradicts odometry"
 
 
 def accepted(edges: Edges, acceptance: Acceptance, drift: Drift | None, in_order: bool = True) -> tuple[Edges, Ints]:
-    """The table with `status` and `why` of every registered pair: used, or rejected; those held out stay so. Beside it
-    the rows (S,) that odometry slid to unnoticed, as the pairs over these steps agree.
+    """The table with `status` (used or rejected) and `why` of every registered pair, and the rows (S,) to which an
+    odometry step slid unnoticed, as the pairs across that step agree. Held-out pairs stay as they are.
 
-    `drift`: what odometry says of the path between two frames; None without odometry. `in_order`: whether rows that
-    follow each other are steps of a path.
+    `drift`: odometry's poses and their covariance, None without odometry. `in_order`: whether consecutive rows are
+    steps of a path.
     """
     rows = np.flatnonzero(edges.status != HELD_OUT)
     registered = edges.select(rows)
@@ -33,10 +33,10 @@ def accepted(edges: Edges, acceptance: Acceptance, drift: Drift | None, in_order
 
 
 def with_odometry(edges: Edges, odometry: Edges) -> Edges:
-    """The table with odometry's own measurements, which count, in the place of registrations that contradict them, but
-    for those that fit clearly better: these count.
+    """The table with every odometry step whose registration was rejected as contradicting odometry accepted again:
+    with odometry's own measurement, or with the registration where that fits better by more than `SAME_FITNESS`.
 
-    Where clouds slide, a registration from the poses of a round ends where one from the step before did not.
+    Where clouds slide, the round's registration of a step may end elsewhere than odometry's.
     """
     steps = np.flatnonzero((odometry.proposed_by == "sequential") & (odometry.status == USED))
     measured = {(int(i), int(j)): int(row) for row, (i, j) in zip(steps, odometry.pairs[steps], strict=True)}

@@ -16,7 +16,7 @@ MIN_SIGMA_SHARE = 0.02
 """No sensor is better than 1/50 of the distance that it is matched within, 1 mm of 5 cm in a room: keeps noise-free
 (modelled) pairs finite in any unit."""
 SAME_FITNESS = 0.05
-"""What the fitness of two registrations of a pair may differ by that surfaces cannot tell apart."""
+"""Difference of fitness below which two registrations of a pair fit its surfaces equally well."""
 
 FindNearest: TypeAlias = Callable[[Floats], tuple[Ints, Floats]]
 """Rows of the nearest target points, and squared distances in m², for query points (N, 3)."""
@@ -79,7 +79,9 @@ def plane_jacobian(normals_in_i: Floats, points_in_j: Floats, i_from_j: Floats) 
 
 
 def to_registration(assessment: Assessment, i_from_j: Floats, iterations: int, converged: bool) -> Registration:
-    """The registrar's answer; what has no correspondence has not converged, whatever its optimiser says."""
+    """The registrar's answer; with fewer than `MIN_POINTS` correspondences it has not converged, whatever the optimiser
+    says.
+    """
     return Registration(
         i_from_j=i_from_j,
         information=assessment.information,
@@ -92,5 +94,5 @@ def to_registration(assessment: Assessment, i_from_j: Floats, iterations: int, c
 
 
 def unregistered(i_from_j: Floats) -> Registration:
-    """The answer where there is nothing to register: the guess, which nothing supports."""
+    """The answer where there is nothing to register: the guess, with no information and not converged."""
     return to_registration(NOTHING, i_from_j, iterations=0, converged=False)

@@ -1,4 +1,4 @@
-"""What tracking left apart, tried again: key frames before a break are registered to those behind it."""
+"""Breaks of tracking closed: key frames before a break are registered to those after it."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def bridge(
     options: OdometryOptions,
     workers: Workers,
 ) -> tuple[Edges, Floats]:
-    """The good steps with the bridges that were found, and the poses (K, 4, 4) moved accordingly, of K key frames.
+    """The good steps and the bridges found, and the poses (K, 4, 4) of the K key frames with the bridges applied.
 
-    A step of less than `options.min_fitness` is a break. The bridge over it is the fittest registration of one of the
-    three key frames before it and one of the three behind.
+    A step with a fitness below `options.min_fitness` is a break; its bridge is the fittest registration between one of
+    the three key frames before it and one of the three after it.
     """
     good = steps.fitness >= options.min_fitness
     breaks = steps.pairs[~good]

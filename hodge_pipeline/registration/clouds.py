@@ -26,16 +26,15 @@ NORMAL_NEIGHBOURS = 10
 MANY_POINTS = 5_000_000
 LISTED_NOTES = 5
 MAP_AWAY = 10.0
-"""Times the spread of a cloud's points: from there on they are not seen from the origin, but counted from it."""
+"""A cloud whose median range is this many times its extent is in map coordinates, not in the sensor's axes."""
 MAX_VOXELS_ALONG_AXIS = 2_000_000  # its cube still fits the 64-bit voxel key
 BLANK_LEVELS = 6
-"""Of 255, by which nearly all pixels of a blank image differ at most: a covered camera's do by 5 where its noise is 2
-levels. Images of fr1/rpy, fr1/xyz, red kitchen, ICL-NUIM and rendered rooms span 113 and more, 11 at a tenth of their
-brightness."""
+"""Grey levels of 255 that a blank image spans at most: a covered camera's span 5 with a noise of 2 levels. Images of
+fr1/rpy, fr1/xyz, red kitchen, ICL-NUIM and rendered rooms span 113 and more, 11 at a tenth of their brightness."""
 FEW_PIXELS = 0.02
-"""Of an image's: the brightest and the darkest that do not count. The rim of a lens' image is a hundredth."""
+"""Share of the pixels ignored at either end of that span: the black rim of an undistorted image is a hundredth."""
 BLANK_STRIDE = 4
-"""Pixels between two that are looked at for it."""
+"""Every so many rows and columns are tested."""
 BLANK = "its depth is sound, but its colour image shows nothing: black, or of one even colour"
 
 
@@ -68,8 +67,8 @@ class CloudOptions:
     unit_m: float = Field(
         default=1.0,
         gt=0,
-        description="the metre in the unit of the source, which `scale` sets: the noise of pixels and depth is known "
-        "in metres",
+        description="length units of the source per metre, set by `scale`: the noise of pixels and depth is known in "
+        "metres",
     )
 
     @model_validator(mode="after")
@@ -81,7 +80,7 @@ class CloudOptions:
         return self
 
     def stride_of(self, camera: Camera) -> int:
-        """The rows and columns of this camera's depth images from one that is taken to the next."""
+        """The stride, in rows and columns, at which this camera's depth images are sampled."""
         return min(self.stride, max(1, round(abs(camera.fx) * self.voxel_m / self.max_range_m)))
 
 
@@ -153,7 +152,7 @@ def _landmarks(frame: Frame, options: CloudOptions) -> Landmarks:
 
     try:
         return find_landmarks(frame, options.landmarks, options.min_range_m, options.max_range_m)
-    except (SourceError, OSError):  # said where the colours are read
+    except (SourceError, OSError):  # reported where the colours are read
         return Landmarks.none()
 
 
@@ -166,13 +165,13 @@ def prepare_clouds(
     """
     every: list[CloudCounts] = []
 
-    def told(block: tuple[CloudSet, list[CloudCounts]]) -> CloudSet:
+    def counted_in(block: tuple[CloudSet, list[CloudCounts]]) -> CloudSet:
         every.extend(block[1])
         advance(len(block[1]))
         return block[0]
 
-    made = workers.map(partial(_make_block, options=options), frame_blocks(frames))
-    clouds = CloudSet.write(folder, map(told, in_order(made)))
+    made = workers.map(partial(_make_block, options=options), in_blocks(frames))
+    clouds = CloudSet.write(folder, map(counted_in, in_order(made)))
     odd = [counts.odd for counts in every if counts.odd is not None]
     if not any(counts.points for counts in every):
         reason = odd[0] if odd else "the source has no frames"
@@ -181,7 +180,7 @@ def prepare_clouds(
     return clouds, shortened(odd) + _no_returns(every)
 
 
-def frame_blocks(frames: Sequence[Frame]) -> list[Sequence[Frame]]:
+def in_blocks(frames: Sequence[Frame]) -> list[Sequence[Frame]]:
     """The frames in blocks for workers."""
     return [frames[start : start + FRAMES_IN_BLOCK] for start in range(0, len(frames), FRAMES_IN_BLOCK)]
 
@@ -209,8 +208,9 @@ def _no_returns(every: Sequence[CloudCounts]) -> tuple[str, ...]:
 
 
 def is_blank(image: Bytes) -> bool:
-    """Whether an image, (H, W) or (H, W, 3), shows nothing: black, or of one even colour, a few pixels aside, and zeros
-    that are fewer than half: they surround the image of a lens that was made straight.
+    """Whether an image, (H, W) or (H, W, 3), is black or of one even colour, but for `FEW_PIXELS`.
+
+    Zeros are ignored where they are fewer than half of the pixels: the rim of an undistorted image.
     """
     pixels = image[::BLANK_STRIDE, ::BLANK_STRIDE]
     for levels in pixels.reshape(pixels.shape[0] * pixels.shape[1], -1).T:
@@ -281,7 +281,7 @@ def _back_project(frame: Frame, read_depth: Callable[[], Floats32], camera: Came
             blank = is_blank(image)
         except (SourceError, OSError) as error:
             odd = Oddity(frame.frame_id, "its cloud has no colours", str(error))
-    why_none = "" if len(rows) else _out_of_range(z, "depth_scale", options)
+    why_none = "" if len(rows) else _range_advice(z, "depth_scale", options)
     return _Samples(np.stack([x, y, z_kept], axis=1), colours, z.size, odd, why_none, blank)
 
 
@@ -310,9 +310,7 @@ def in_range(cloud: PointCloud, options: CloudOptions) -> PointCloud:
 
 
 def out_of_range(cloud: PointCloud, options: CloudOptions) -> str:
-    """What to do about points none of which is in range: scanners store millimetres as often as metres, and maps count
-    from far away.
-    """
+    """Why no point is in range and what to do: points may be in millimetres, or in map coordinates."""
     ranges = _ranges(cloud)
     finite = np.isfinite(ranges) & (ranges > 0)
     points, usual = cloud.points_in_cam[finite], float(np.median(ranges[finite])) if finite.any() else 0.0
@@ -323,10 +321,11 @@ def out_of_range(cloud: PointCloud, options: CloudOptions) -> str:
             f"its points lie {usual:.3g} m away, all near each other: map coordinates? Subtract one corner from all "
             f"scans, in double precision, and write them again: float32 rounds them to {rounding_m:.2g} m there"
         )
-    return _out_of_range(ranges, "units_per_metre", options)
+    return _range_advice(ranges, "units_per_metre", options)
 
 
-def _out_of_range(ranges: Floats32, option: str, options: CloudOptions) -> str:
+def _range_advice(ranges: Floats32, option: str, options: CloudOptions) -> str:
+    """Why no depth, or range, is within the limits; `option` is the reader's that sets their unit."""
     finite = ranges[np.isfinite(ranges) & (ranges > 0)]
     if not len(finite):
         return "there is no point in it"

@@ -1,4 +1,4 @@
-"""What colours say of a hypothesis: one surface keeps its hue, places that look alike differ in some of theirs."""
+"""Evidence of colours on a registration: one surface keeps its hue, look-alike places differ in some hues."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ SURFACES_KEPT = 64
 """Trees in memory, 0.1 to 1 MB each; pairs come sorted by their first cloud."""
 FEWEST_COMPARED = 100
 NEAR_SPACINGS = 1.5
-"""Points of two clouds within so many times the distance between neighbours are of one surface."""
+"""Distance of points of one surface, at most, in distances between neighbours of a cloud."""
 DARK = 20.0
-"""Added to 8-bit colours, whose ratios mean little in the dark."""
+"""Added to 8-bit colours, since ratios of dark ones are noise."""
 OTHER_HUE = 0.4
 """Difference of the logarithms of a channel, each over the mean of the three; shading changes all three alike."""
 

@@ -14,17 +14,20 @@ from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, Floats, Floats32, Ints
 
 MOST_MATCHES = 1500
-"""Matches that are compared with each other, the first ones given: 9 MB, about 40 ms."""
+"""Matches compared with each other, the first ones given: 9 MB, about 40 ms."""
 SEEDS = 160
+"""Matches whose groups of compatible matches are tried as a motion."""
 PARTNERS = 20
+"""Compatible matches in such a group."""
 FEWEST_MATCHES = 4
 REFINEMENTS = 8
+"""Least-squares fits to the inliers, at most."""
 
 
 @dataclass(frozen=True)
 class Consensus:
-    """The motion `i_from_j` (4, 4), the matches (M,) that it explains, and its best rival, by the matches left over:
-    where places look alike, or surfaces slide on each other, it explains nearly as many.
+    """The motion `i_from_j` (4, 4), its inliers among the matches (M,), and its rival: the best motion by the outliers,
+    with nearly as many inliers where places look alike or surfaces slide.
     """
 
     i_from_j: Floats
@@ -33,17 +36,17 @@ class Consensus:
 
     @property
     def rival_count(self) -> int:
-        """How many of the matches left over the rival explains."""
+        """Inliers of the rival."""
         return 0 if self.rival is None else self.rival.count
 
     @property
     def count(self) -> int:
-        """How many matches it explains."""
+        """Inliers of the motion."""
         return int(self.inlier.sum())
 
 
 def rigid_consensus(points_in_i: Floats, points_in_j: Floats, tolerance_m: float) -> Consensus:
-    """The motion that explains most matches (M, 3), each to within `tolerance_m`; the best matches come first.
+    """The motion with most inliers among matches (M, 3), to within `tolerance_m`; the best matches come first.
 
     The identity with no inlier where there are fewer than four matches.
     """

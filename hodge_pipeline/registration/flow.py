@@ -31,8 +31,8 @@ BACKWARD_PX = 0.7
 
 @dataclass(frozen=True, eq=False)
 class FlowImage:
-    """One frame as the flow wants it: its grey image and its depth image (H, W), its camera, its range of depth, and
-    the metre in the unit of its depth.
+    """One frame for optical flow: grey and depth image (H, W), the camera, the valid range of depth, and how many units
+    of depth a metre has.
     """
 
     grey: Bytes
@@ -61,9 +61,8 @@ class Corners:
 
 @dataclass(frozen=True)
 class Followed:
-    """What a frame shows of its key frame's corners: rows (m,) of those that agree on its motion, and where it saw
-    them, `seen (m, 3)`, columns u, v, z (NaN: no depth there); the motion, its information, and the `share` of those
-    followed that agree.
+    """The motion of a frame by its key frame's corners: `rows (m,)` are the inliers among the corners, `seen (m, 3)`
+    where the frame saw them, columns u, v, z (NaN: no depth there), `share` that of inliers among the corners followed.
     """
 
     rows: Any
@@ -99,7 +98,7 @@ def find_corners(image: FlowImage, where: Bytes | None = None) -> Corners:
 
 
 def follow(corners: Corners, view: FlowImage, guess: Floats) -> Followed | None:
-    """The key frame's corners in another frame, from a guess (4, 4) of its motion; None where too few agree on one."""
+    """The motion of another frame by the key frame's corners, from a guess (4, 4); None with too few inliers."""
     expected = project(se3.transform(se3.inverse(guess), corners.points), view.camera)[:, :2]
     height, width = view.depth.shape
     inside = np.flatnonzero(((expected >= 0) & (expected < [width, height])).all(axis=1))

@@ -1,4 +1,4 @@
-"""Whether frames fit what they saw of their key frames better with another focal length than the camera's."""
+"""The focal length that the reprojection errors of tracked frames tell, to check the camera's own."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from hodge_pipeline.registration.readout import with_readout
 from hodge_pipeline.registration.reposing import view_at_stamps
 from hodge_pipeline.registration.resection import focal_evidence, resect
 from hodge_pipeline.registration.sightings import views
-from hodge_pipeline.types import Floats, Frame
+from hodge_pipeline.types import Camera, Floats, Frame
 from hodge_pipeline.types.arrays import evenly, groups
 
 MOST_VIEWS = 50
-"""That are looked at, evenly spread: a view takes 8 CPU ms."""
+"""Views used, evenly spread: each takes 8 CPU ms."""
 ROUNDS = 3
-"""Of Gauss–Newton on the logarithm: of a focal length that is 25 % off the last one moves it by 2 %."""
+"""Gauss–Newton steps on log f: with a focal length 25 % off the last one moves it by 2 %."""
 FEWEST_KEYS = 5
-"""Key frames, by which the interval is drawn anew: what is seen of one shares its errors."""
+"""Key frames that the bootstrap of the interval needs: it draws key frames, since views of one share its errors."""
 DRAWS = 500
 OTHER = 0.07
-"""Of the logarithm: a camera that is right may be as far off, since images of depth and colour are not calibrated. Of
-fr1/rpy, fr1/xyz and two parts of red kitchen 0.02, 0.01, 0.01 and 0.06 are found.
+"""Of log f: a right camera may be so far off where depth and colour are not calibrated to each other. Of fr1/rpy,
+fr1/xyz and two parts of red kitchen 0.02, 0.01, 0.01 and 0.06 are found.
 """
 
 
@@ -40,16 +40,16 @@ class Focal:
 
     @property
     def is_other(self) -> bool:
-        """Whether the camera's own does not fit."""
+        """Whether the camera's own lies outside the interval by more than `OTHER`."""
         return bool(np.log(self.low / self.own) > OTHER or np.log(self.own / self.high) > OTHER)
 
 
 def estimate_focal(
     sightings: Path, frames: Sequence[Frame], world_from_cam: Floats, twists: Floats, readout_s: float, unit_m: float
 ) -> Focal | None:
-    """The focal length with which views (a folder of `Sightings`) fit best, each posed anew with it.
+    """The focal length of least reprojection error in views (a folder of `Sightings`), their poses estimated with it.
 
-    `twists (N, 6)` as of `velocities`. None where cameras differ, or where views are of too few key frames.
+    `twists (N, 6)`: see `shutter.velocities`. None where cameras differ, or views are of too few key frames.
     """
     cameras, found = {frame.camera for frame in frames}, list(views(sightings))
     camera = next(iter(cameras))
@@ -63,14 +63,7 @@ def estimate_focal(
     drawn = np.random.default_rng(0).integers(0, len(keys), (DRAWS, len(keys)))
     log = 0.0
     for _ in range(ROUNDS):
-        evidence = np.zeros((len(chosen), 2))
-        tried = replace(camera, fx=camera.fx * np.exp(log), fy=camera.fy * np.exp(log))
-        for at, (points, seen) in enumerate(stamped):
-            points = points * [np.exp(-log), np.exp(-log), 1.0]
-            fit = resect(points, seen, tried, poses[at], unit_m)
-            if fit is not None:
-                poses[at] = fit.known_from_cam
-                evidence[at] = focal_evidence(points, seen, tried, fit.known_from_cam, unit_m)
+        evidence = _evidence(stamped, poses, camera, log, unit_m)
         of_key = np.array([evidence[rows].sum(axis=0) for _, rows in keys])
         gradient, information = of_key[drawn].sum(axis=1).T
         if not information.all():
@@ -78,3 +71,18 @@ def estimate_focal(
         low, high = camera.fx * np.exp(log + np.quantile(gradient / information, [0.01, 0.99]))
         log += float(evidence[:, 0].sum() / evidence[:, 1].sum())
     return Focal(camera.fx, camera.fx * float(np.exp(log)), float(low), float(high))
+
+
+def _evidence(
+    stamped: Sequence[tuple[Floats, Floats]], poses: list[Floats], camera: Camera, log: float, unit_m: float
+) -> Floats:
+    """`focal_evidence` (V, 2) of each view at exp(log) times the camera's focal length; updates `poses`."""
+    evidence = np.zeros((len(stamped), 2))
+    tried = replace(camera, fx=camera.fx * np.exp(log), fy=camera.fy * np.exp(log))
+    for at, (points, seen) in enumerate(stamped):
+        points = points * [np.exp(-log), np.exp(-log), 1.0]
+        fit = resect(points, seen, tried, poses[at], unit_m)
+        if fit is not None:
+            poses[at] = fit.known_from_cam
+            evidence[at] = focal_evidence(points, seen, tried, fit.known_from_cam, unit_m)
+    return evidence

@@ -18,12 +18,12 @@ from hodge_pipeline.types import Floats, Ints, PointCloud, Registration
 
 ROTATION_EPSILON_RAD = 1e-3
 EPSILON_SHARE = 0.02
-"""Of the finest distance: 1 mm of the usual 5 cm."""
+"""Least step of translation, of the finest distance: 1 mm of the usual 5 cm."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class _SmallGicp:
-    """What both forms can be told."""
+    """Options and levels that both forms share."""
 
     distances_m: tuple[float, ...] = Field(
         default=(0.3, 0.1, 0.05),
@@ -72,7 +72,7 @@ class _SmallGicp:
     def _registered(
         self, align: Callable[..., Any], target: PreparedCloud, source: PreparedCloud, guess: Floats
     ) -> Registration:
-        """Level by level; `align` has small_gicp align a sample of the source with the target."""
+        """The registration, level by level; `align` calls small_gicp on a sample of the source."""
 
         def at(level: _Level, guess: Floats) -> Any:
             return align(
@@ -151,7 +151,7 @@ class Vgicp(_SmallGicp):
 
 
 class PreparedCloud:
-    """What small_gicp needs of one cloud. A target costs a tree and all covariances, a source only a sample's."""
+    """A cloud with what small_gicp needs. A target costs a tree and all covariances, a source only a sample's."""
 
     def __init__(self, cloud: PointCloud, neighbours: int, voxel_m: float = 0.1, seed: int = 0) -> None:
         finite = np.isfinite(cloud.points_in_cam).all(axis=1)

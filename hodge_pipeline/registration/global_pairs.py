@@ -85,7 +85,7 @@ def match_pairs(described: Path, registrar: GlobalRegistrar, pairs: Ints, worker
 
 
 def load_description(described: Path, row: int) -> Any:
-    """What the registrar made of one cloud."""
+    """The registrar's description of one cloud."""
     path = described / f"{row}.pickle"
     return _load(path, path.stat().st_mtime_ns)
 
@@ -107,6 +107,6 @@ def _match_block(described: Path, registrar: GlobalRegistrar, pairs: Ints) -> Ma
 
 @lru_cache(maxsize=DESCRIPTIONS_KEPT)
 def _load(path: Path, written_ns: int) -> Any:
-    """Another run in this process may have written the file anew."""
+    """The description in a file; `written_ns` makes the cache miss when another run has written it anew."""
     with open_input(path) as file:
         return pickle.load(file)

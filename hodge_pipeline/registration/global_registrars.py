@@ -1,4 +1,4 @@
-"""Registration of two clouds with no guess: FPFH matches, and who decides which of them are right."""
+"""Registration of two clouds without a guess: FPFH matches and a consensus among them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class FpfhConsensus:
         return replace(levels[0], coarser=tuple(levels[1:]))
 
     def match(self, target: DescribedCloud, source: DescribedCloud) -> Match:
-        """Where the source lies in the target: the motion that leads its rival most, the others beside it."""
+        """The motion of the source in the target whose inliers lead its rival's most, with the others as `others`."""
         found: list[Match] = []
         levels = zip((target, *target.coarser), (source, *source.coarser), self.scales, strict=True)
         for level_i, level_j, factor in levels:

@@ -1,4 +1,4 @@
-"""A registrar for clouds in another unit: what it knows of sensors and of convergence is in metres of a room."""
+"""A registrar for clouds in another unit: its thresholds and sensor noise are in metres."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hodge_pipeline.types import Floats, PointCloud, Registration
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
 class InUnits:
-    """Registers clouds whose unit is `unit_m` times smaller than the registrar's; what it gives is in theirs."""
+    """Registers clouds with `unit_m` length units per metre; results are in the clouds' unit."""
 
     registrar: Registrar
     unit_m: float = Field(gt=0)

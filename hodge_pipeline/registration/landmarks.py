@@ -5,11 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from hodge_pipeline.registration.resection import back_project
 from hodge_pipeline.types import Bools, Bytes, Camera, Floats, Floats32, Frame, Ints, Landmarks
 
 EDGE_STEP = 0.03
-"""A landmark whose 3x3 pixels differ by more than this share of its depth lies on an edge: its depth is a guess."""
-
+"""Share of its depth by which the 3x3 pixels of a landmark differ at most: others lie on an edge."""
 WIDE_PX, SHRUNK = 640, 0.7
 """An image at least so wide is shrunk first: SIFT begins with it doubled, and finds the finest features where a pixel's
 noise is largest. Less than half the time, and smaller errors in four of six videos (fr1/xyz and one of the rendered
@@ -18,8 +18,8 @@ ones have 4 and 11 % more); at 0.5 too few features are left of a bare room, who
 FEW = 150
 """Landmarks of a frame below which its image is looked at again for faint ones."""
 CONTRAST, FAINT_CONTRAST = 0.04, 0.005
-"""Of a feature; the first is OpenCV's own. Faint ones match less exactly (TUM fr1/rpy: a tenth more error), but
-without them an image of a bare cabinet has next to none."""
+"""SIFT contrast thresholds; the first is OpenCV's own. Faint features match less exactly (TUM fr1/rpy: a tenth more
+error), but without them an image of a bare cabinet has next to none."""
 
 
 def find_landmarks(frame: Frame, count: int, min_range_m: float, max_range_m: float) -> Landmarks:
@@ -37,7 +37,8 @@ def find_landmarks(frame: Frame, count: int, min_range_m: float, max_range_m: fl
         if not len(pixels):
             continue
         z, sound = sound_depth(depth, np.round(pixels).astype(np.int64), min_range_m, max_range_m)
-        points = back_projected(pixels[sound].astype(np.float32), z[sound], frame.camera)
+        seen = np.column_stack([pixels[sound].astype(np.float32), z[sound]]).astype(float)
+        points = back_project(seen, frame.camera).astype(np.float32)
         marks = Landmarks(points, descriptors[sound], _pixel_rad(len(points), grey, depth, frame.camera))
         if len(marks) >= min(FEW, count):
             break
@@ -45,7 +46,7 @@ def find_landmarks(frame: Frame, count: int, min_range_m: float, max_range_m: fl
 
 
 def _pixel_rad(count: int, grey: Bytes, depth: Floats32, camera: Camera) -> Floats32:
-    """The angle (n,) of a pixel of the image, whose features are found in it however large the depth image is."""
+    """The angle in radians (n,) that a pixel of the colour image covers, which may be larger than the depth image."""
     return np.full(count, depth.shape[1] / (grey.shape[1] * camera.fx), np.float32)
 
 
@@ -61,12 +62,6 @@ def _features(grey: Bytes, depth_shape: tuple[int, ...], count: int, contrast: f
     strongest = np.argsort([-point.response for point in found], kind="stable")[:count]
     pixels = (np.array([found[row].pt for row in strongest]) + 0.5) * larger - 0.5
     return pixels, np.asarray(descriptors)[strongest].astype(np.uint8)
-
-
-def back_projected(pixels: Floats32, depth_m: Floats32, camera: Camera) -> Floats32:
-    """Points (n, 3) in the camera's axes of pixels (n, 2) at these depths (n,)."""
-    slopes = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    return np.column_stack([slopes * depth_m[:, None], depth_m]).astype(np.float32)
 
 
 def sound_depth(depth: Floats32, pixels: Ints, min_range_m: float, max_range_m: float) -> tuple[Floats32, Bools]:

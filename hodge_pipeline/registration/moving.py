@@ -32,15 +32,15 @@ GREY_LEVELS = 20.0
 """Grey values, of 256, of the mean of a few pixels: more than noise and interpolation change in a static scene."""
 OFF_M, OFF_SIGMAS = 0.05, 3.0
 """By which a depth is off what a motion predicts: what clouds are matched within, and beyond the noise of a pixel."""
-UNTOLD_S = (-1 / 60, 1 / 60)
-"""Seconds by which a colour image may be later than its depth image beyond what is said: half the time between two
-images, within which they are paired. fr1/rpy's stamps keep silent about 15 ms, in which its camera turns by 15 pixels.
+EXTRA_DELAYS_S = (-1 / 60, 1 / 60)
+"""Seconds by which colour may be later than depth beyond what the stamps say, half the time between two images: of
+fr1/rpy it is 15 ms, in which its camera turns by 15 pixels.
 """
 
 
 class Moments(NamedTuple):
-    """How the cameras of key frame and view moved, twists (6,) a second in their own axes, and the seconds by which the
-    colour image of each is said to be later than its depth image.
+    """The velocities of key frame and view, twists (6,) per second in the camera's axes, and by how many seconds the
+    colour image of each is later than its depth image by their stamps.
     """
 
     key_twist: Floats
@@ -48,10 +48,10 @@ class Moments(NamedTuple):
     key_delay_s: float = 0.0
     view_delay_s: float = 0.0
 
-    def between_depths(self, key_from_view: Floats, untold_s: float) -> Floats:
-        """The motion (4, 4) between the depth images, from that between the colour images."""
-        key = se3.exp(self.key_twist * (self.key_delay_s + untold_s))
-        return np.asarray(key @ key_from_view @ se3.exp(-self.view_twist * (self.view_delay_s + untold_s)))
+    def between_depths(self, key_from_view: Floats, extra_s: float = 0.0) -> Floats:
+        """The motion (4, 4) between the depth images, from that between the colour images; `extra_s` adds to delays."""
+        key = se3.exp(self.key_twist * (self.key_delay_s + extra_s))
+        return np.asarray(key @ key_from_view @ se3.exp(-self.view_twist * (self.view_delay_s + extra_s)))
 
 
 AT_REST = Moments(np.zeros(6), np.zeros(6))
@@ -78,18 +78,19 @@ def contradicting(key: FlowImage, view: FlowImage, key_from_view: Floats, moment
 
 
 def misplaced(key: FlowImage, view: FlowImage, key_from_view: Floats, moments: Moments = AT_REST) -> float:
-    """The share of the tested pixels whose depth in the view is off what a motion predicts, by `OFF_M` and
-    `OFF_SIGMAS`: few where both see one rigid scene, most of a bare room where the motion is an object's. Where it is
-    much, but not most, of the image, the delay counts with which the least is, as in `_compared`.
+    """The share of the tested pixels whose depth in the view differs from what a motion predicts by more than `OFF_M`
+    and `OFF_SIGMAS`: small for a rigid scene, most of a bare room where the motion is an object's. Between `MUCH` and
+    `MOST` it is the least share over the possible delays of colour, as in `_compared`.
     """
     share = _off(key, view, key_from_view)
     if not MUCH < share < MOST:
         return share
-    return min(share, *(_off(key, view, moments.between_depths(key_from_view, delay)) for delay in (0.0, *UNTOLD_S)))
+    motions = [moments.between_depths(key_from_view, extra_s) for extra_s in (0.0, *EXTRA_DELAYS_S)]
+    return min(share, *(_off(key, view, motion) for motion in motions))
 
 
 def _off(key: FlowImage, view: FlowImage, key_from_view: Floats) -> float:
-    """The share that `misplaced` tells, by the motion of the depth images."""
+    """The share of misplaced pixels, by the motion between the depth images."""
     expected = _expected(key, view, key_from_view)
     off = np.abs(_depth(view, expected[:, :2]) - expected[:, 2]) / view.unit_m
     seen = np.isfinite(off)
@@ -100,8 +101,8 @@ def _off(key: FlowImage, view: FlowImage, key_from_view: Floats) -> float:
 def rival_motion(
     corners: Corners, view: FlowImage, found: Followed, guess: Floats, moments: Moments = AT_REST
 ) -> tuple[float, Rival | None]:
-    """How much contradicts the motion found, and the motion of corners where that has none; None where little
-    contradicts it, or no other motion agrees.
+    """The share of the image that contradicts the motion found, and the motion of corners in tiles without its inliers;
+    None where no more than `MUCH` contradicts it, or those corners show no other motion.
     """
     key = corners.image
     share, misfit = _compared(key, view, found.key_from_view, moments)
@@ -124,18 +125,18 @@ def rival_motion(
 def _compared(key: FlowImage, view: FlowImage, key_from_view: Floats, moments: Moments) -> tuple[float, Floats]:
     """The share that contradicts a motion, and the misfit (n,) at each tested pixel.
 
-    Where a camera turns, depth lies elsewhere than the colour image's motion says if the two images are not of one
-    moment: where much contradicts, the delay of `UNTOLD_S` with which the least does counts.
+    Where a camera turns and colour is later than depth, depth moves otherwise than colour: where more than `MUCH`
+    contradicts, each of `EXTRA_DELAYS_S` is tried too and the least share counts.
     """
-    told = _at_delay(key, view, key_from_view, moments.between_depths(key_from_view, 0))
-    if told[0] <= MUCH:
-        return told
-    others = (moments.between_depths(key_from_view, untold_s) for untold_s in UNTOLD_S)
-    return min([told, *(_at_delay(key, view, key_from_view, motion) for motion in others)], key=lambda one: one[0])
+    stamped = _at_delay(key, view, key_from_view, moments.between_depths(key_from_view))
+    if stamped[0] <= MUCH:
+        return stamped
+    others = (moments.between_depths(key_from_view, extra_s) for extra_s in EXTRA_DELAYS_S)
+    return min([stamped, *(_at_delay(key, view, key_from_view, motion) for motion in others)], key=lambda one: one[0])
 
 
 def _at_delay(key: FlowImage, view: FlowImage, by_colour: Floats, by_depth: Floats) -> tuple[float, Floats]:
-    """What `_compared` tells, by the motion of the colour images and that of the depth images."""
+    """Share and misfit (n,) as of `_compared`, by the motions of the colour and of the depth images."""
     expected = _expected(key, view, by_depth)
     change = _grey(view, _expected(key, view, by_colour)[:, :2]) - _tested(key).grey
     misfit = _misfit(view, expected, _depth(view, expected[:, :2]), change)
@@ -149,7 +150,7 @@ def _expected(key: FlowImage, view: FlowImage, key_from_view: Floats) -> Floats:
 
 
 def _votes(key: FlowImage, gain: Floats) -> tuple[int, int]:
-    """The tiles that another motion fits better by so much (n,) at each pixel, and those that it fits worse."""
+    """How many tiles another motion fits better and how many worse, by its gain (n,) in misfit at each tested pixel."""
     compared = np.isfinite(gain)
     votes = np.bincount(_tested(key).tile[compared], gain[compared], minlength=TILES**2)
     return int((votes > 1).sum()), int((votes < -1).sum())
@@ -177,8 +178,8 @@ def _tested(key: FlowImage) -> _Tested:
 
 
 def _misfit(view: FlowImage, expected: Floats, actual: Floats, change: Floats) -> Floats:
-    """How far the depth (n,) in the view is off columns u, v, z (n, 3) and the grey value has changed (n,), 1: by as
-    much as may be or more; NaN where not both frames have a depth.
+    """Misfit (n,) in [0, 1] of `actual` depths (n,) against `expected` u, v, z (n, 3), and of the change (n,) of grey
+    values less its median (the exposure); NaN where not both frames have a depth.
     """
     sigma = DEPTH_SIGMAS * view.unit_m * depth_sigma(expected[:, 2] / view.unit_m)
     off = (actual - expected[:, 2]) / (GATE_PX / PIXEL_SIGMA * sigma)

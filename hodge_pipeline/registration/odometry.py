@@ -25,7 +25,7 @@ SURE_FITNESS = 0.7
 """Below it a second registration starts from no motion, and the fitter one is kept; over a hole in the recording (a
 step ten times as long as usual) it must be reached, or tracking is lost."""
 REACHES_APART = 4.0
-"""What nothing joins begins so many reaches of a cloud apart: two clouds that face each other do not meet."""
+"""Gap between unconnected components in the layout, times the reach of a cloud, so that no two clouds meet."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))

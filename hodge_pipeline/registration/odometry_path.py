@@ -1,7 +1,7 @@
-"""Pairs held against the path of odometry between their frames, by the covariance of that path and their own.
+"""Pairs tested against the odometry path between their frames, by the covariances of both.
 
-Errors of steps add up along the path as if they were independent. Few steps err by much more than they say, so the
-sum is compared under Student's distribution; one that slid unnoticed is found by the pairs over it, which agree.
+Errors of steps are taken as independent, so their covariances add up along the path. A few steps err by much more than
+their covariance, hence Student's distribution; a step that slid unnoticed is found by the pairs across it, which agree.
 """
 
 from __future__ import annotations
@@ -17,18 +17,16 @@ from hodge_pipeline.scene import Drift
 from hodge_pipeline.types import Bools, Edges, Floats, Ints
 
 WITNESS = 3.0
-"""Nats by which a pair must be likelier, or less likely, after a step is mended to count for that, or against it."""
+"""Change of a pair's log-likelihood, in nats, from which it counts for, or against, the correction of a step."""
 FEWEST_FOR, MOST_AGAINST = 3, 0.1
-"""Pairs that must say that a step slid, and for each so many that may say the contrary, as wrong ones do by chance."""
+"""Pairs that must support a correction, and opposing ones per supporting one at most: wrong pairs oppose by chance."""
 SEEDS, LONGEST, MOST_SLIDES = 16, 8, 10
-"""Pairs that are asked where a step should have led, steps of each that are tried, and steps that are mended: limits on
-cost.
-"""
+"""Limits on cost: pairs taken as a step's correction, steps tried for each, and steps corrected in all."""
 
 
 def drift_of(world_from_cam: Floats, steps: Edges, tail: float | None) -> Drift:
-    """What odometry's poses (K, 4, 4) and the steps that led to them say of pairs; `tail` of right pairs, by chance,
-    contradict it, None: no pair does.
+    """Odometry's poses (K, 4, 4) and the covariance of its path, from its steps, with the gate that a share `tail` of
+    right pairs fails by chance; None: no gate.
     """
     covariance = np.zeros((len(world_from_cam), 6, 6))
     ends = steps.pairs.max(axis=1, initial=0)
@@ -39,18 +37,16 @@ def drift_of(world_from_cam: Floats, steps: Edges, tail: float | None) -> Drift:
 
 
 def contradicts_odometry(registered: Edges, drift: Drift) -> Bools:
-    """Where (P,) a pair is off odometry's motion by more than the covariances of both allow.
-
-    Never for a pair across two parts that odometry left apart.
-    """
+    """Where (P,) a pair differs from odometry's motion by more than the gate on χ²; never between two components."""
     return _Pairs.of(registered).chi2(drift) > drift.gate
 
 
 def without_slides(registered: Edges, drift: Drift) -> tuple[Drift, Ints]:
-    """Odometry with steps mended that slid unnoticed, and the rows (S,) that these led to.
+    """Odometry with the steps corrected that slid unnoticed, and the rows (S,) that these led to.
 
-    A step slid where the pair over the fewest steps about it contradicts odometry, others over it are likelier if that
-    pair is right, and next to none is less likely: places that look alike have many pairs that agree, but not that one.
+    A step slid where the shortest pair across it contradicts odometry, and correcting the step by that pair makes other
+    pairs across it likelier and next to none less likely. Look-alike places have many pairs that agree, but no such
+    shortest one.
     """
     pairs, slid = _Pairs.of(registered), list[int]()
     for _ in range(MOST_SLIDES):
@@ -87,12 +83,12 @@ class _Pairs:
         return np.asarray(np.where(drift.part[low] == drift.part[high], chi2, 0.0))
 
     def select(self, rows: Bools | Ints) -> _Pairs:
-        """These pairs alone."""
+        """These rows."""
         return _Pairs(self.low[rows], self.high[rows], self.motion[rows], self.covariance[rows])
 
 
 def _slide(pairs: _Pairs, drift: Drift) -> tuple[Drift, int] | None:
-    """Odometry with that step mended for which most pairs speak, and the row that it leads to."""
+    """Odometry with the step corrected that most pairs support, and the row that it leads to; None where none is."""
     within = pairs.select(drift.part[pairs.low] == drift.part[pairs.high])
     before, span = within.chi2(drift), within.high - within.low
     far = np.flatnonzero(before > drift.gate)
@@ -103,11 +99,11 @@ def _slide(pairs: _Pairs, drift: Drift) -> tuple[Drift, int] | None:
             over = np.flatnonzero((within.low < row) & (within.high >= row))
             if span[over].min() < span[seed]:
                 continue
-            mended = _mended(drift, row, within.select(np.array([seed])))
-            gain = _log_density(within.select(over).chi2(mended)) - _log_density(before[over])
+            corrected = _corrected(drift, row, within.select(np.array([seed])))
+            gain = _log_density(within.select(over).chi2(corrected)) - _log_density(before[over])
             score = float((gain > WITNESS).sum() - (gain < -WITNESS).sum() / MOST_AGAINST)
             if score > best:
-                best, found = score, (mended, row)
+                best, found = score, (corrected, row)
     return found
 
 
@@ -116,8 +112,8 @@ def _log_density(chi2: Floats) -> Floats:
     return np.asarray(-0.5 * (FREEDOM + 6) * np.log1p(chi2 / FREEDOM))
 
 
-def _mended(drift: Drift, row: int, seed: _Pairs) -> Drift:
-    """Odometry whose step to `row` leads where this one pair says, as exactly as that pair does."""
+def _corrected(drift: Drift, row: int, seed: _Pairs) -> Drift:
+    """Odometry with the step to `row` corrected so that it agrees with this one pair, with that pair's covariance."""
     poses, covariance = drift.world_from_cam.copy(), drift.covariance.copy()
     end = poses[seed.low[0]] @ seed.motion[0]
     behind = (np.arange(len(poses)) >= row) & (drift.part == drift.part[row])

@@ -26,9 +26,9 @@ CLOUDS_KEPT = 32
 """Prepared clouds that a worker keeps, 2 to 4 MB each."""
 
 HELD_SPREADS = 2.0
-"""Times `Acceptance.min_spread`, from which noise of normals may pass for a hold: in a bare tunnel at 16 beams, where
-GICP slides by whole steps of 1.4 m, the weakest direction has 0.018 to 0.028; 95 % of pairs in a street have 0.04.
-"""
+"""Times `Acceptance.min_spread`: below it noise of the normals may feign a constraint. In a bare tunnel at 16 beams,
+where GICP slides by whole steps of 1.4 m, the weakest direction has 0.018 to 0.028; 95 % of pairs in a street have
+0.04."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -73,13 +73,13 @@ class Acceptance:
 
 
 def unheld_steps(edges: Edges, min_spread: float) -> Bools:
-    """Where (P,) consecutive frames share too little to hold translation in every direction, as before a bare wall."""
+    """Where (P,) consecutive frames leave a direction of translation unconstrained, as before a bare wall."""
     weak, _ = weak_directions(edges, HELD_SPREADS * min_spread)
     return np.asarray(weak.any(axis=1) & _consecutive(edges))
 
 
 def held_where_sliding(registered: Edges, guesses: Floats, min_spread: float) -> Edges:
-    """The table with pairs at their guesses `i_from_j (P, 4, 4)` in directions in which what they share may let them
+    """The table with translations kept at their guesses `i_from_j (P, 4, 4)` along directions in which the surfaces may
     slide (solution remapping, Zhang et al., ICRA 2016).
     """
     weak, directions = weak_directions(registered, HELD_SPREADS * min_spread)
@@ -94,7 +94,7 @@ def held_where_sliding(registered: Edges, guesses: Floats, min_spread: float) ->
 
 
 def weak_directions(registered: Edges, min_spread: float) -> tuple[Bools, Floats]:
-    """Which directions (P, 3) translation is hardly known in, and these as columns (P, 3, 3), in the axes of j."""
+    """Which directions (P, 3) hardly constrain translation, and the directions as columns (P, 3, 3), in j's axes."""
     values, vectors = np.linalg.eigh(np.nan_to_num(registered.information[:, 3:, 3:]))
     return np.asarray(np.maximum(values, 0.0) < min_spread * values.sum(axis=1, keepdims=True)), vectors
 
@@ -153,6 +153,7 @@ def prepared_clouds(folder: Path, registrar: Registrar) -> PreparedClouds:
 
 @lru_cache(maxsize=1)
 def _kept_clouds(folder: Path, written: tuple[int, int], registrar: Hashable) -> PreparedClouds:
+    """The prepared clouds of a folder; `written` makes the cache miss when its files are written anew."""
     return PreparedClouds(folder, cast(Registrar, registrar))
 
 

@@ -1,4 +1,4 @@
-"""The read-out time of a rolling shutter that nobody gave, from what frames saw of their key frames."""
+"""The rolling-shutter read-out time, estimated from the reprojection errors of tracked frames."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ SHORTEST_S = 0.005
 WIDEST = 0.5
 """Width of the interval over the value: a quarter of the shutter's effect is left at its ends."""
 MOST_VIEWS = 100
-"""That are looked at, evenly spread: a view takes 10 CPU ms."""
+"""Views used, evenly spread: each takes 10 CPU ms."""
 FEWEST_KEYS = 5
-"""Key frames, by which the interval is drawn anew: what is seen of one shares its errors."""
+"""Key frames that the bootstrap of the interval needs: it draws key frames, since views of one share its errors."""
 DRAWS = 500
 
 
@@ -46,10 +46,10 @@ def with_readout(camera: Camera, readout_s: float) -> Camera:
 def estimate_readout(
     sightings: Path, frames: Sequence[Frame], world_from_cam: Floats, twists: Floats, unit_m: float
 ) -> Readout | None:
-    """The read-out time at which views (a folder of `Sightings`) fit best, each posed anew at each time tried.
+    """The read-out time of least reprojection error in views (a folder of `Sightings`), their poses estimated with it.
 
-    `twists (N, 6)` as of `velocities`. None where a camera's is known or cameras differ, and where the minimum is not
-    clear: at either end of what was tried, in too wide an interval, or seen from too few key frames.
+    `twists (N, 6)`: see `shutter.velocities`. None where the read-out is known or cameras differ, and where the minimum
+    is not clear: near either end of the times tried, with too wide an interval, or with too few key frames.
     """
     cameras = {frame.camera for frame in frames}
     camera = next(iter(cameras))
@@ -83,7 +83,7 @@ def _costs(
 
 
 def _minimum(costs: Floats) -> Readout | None:
-    """Where the sum of costs (K, T) is least, with its interval over draws of the K rows; None where unclear."""
+    """The time of least total cost (K, T), its interval by bootstrap over the K key frames; None where unclear."""
     if len(costs) < FEWEST_KEYS:
         return None
     drawn = np.random.default_rng(0).integers(0, len(costs), (DRAWS, len(costs)))

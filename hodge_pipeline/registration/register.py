@@ -17,7 +17,7 @@ from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints
 from hodge_pipeline.types.edges import HELD_OUT, REGISTERED, USED
 
 REUSE_WITHIN_M = 0.01
-"""Between a registration and where the poses now put its pair: nearer than any registrar's start must be."""
+"""Distance of a registration from its new guess below which it is reused: any registrar's basin is wider."""
 
 
 def register_edges(
@@ -35,9 +35,9 @@ def register_edges(
 ) -> Edges:
     """Step: the table with its candidates registered from these poses; a killed run goes on at its last block.
 
-    A pair that was registered `earlier`, without its guess or to where the poses put it still, keeps that registration;
-    lengths are multiplied by `scale`. `min_spread`: see `Acceptance`. By GICP it also keeps one that the poses lie
-    nearer to than `earlier_from (N, 4, 4)` did, from which it was registered: its descent leads there again.
+    An `earlier` registration is kept where it needed no guess, where it is within `REUSE_WITHIN_M` of the guess from
+    these poses, or, by GICP, where that guess is nearer to it than the earlier one, from `earlier_from (N, 4, 4)`:
+    GICP would converge to it again. `scale` multiplies lengths; `min_spread`: see `Acceptance`.
     """
     assert clouds.folder is not None
     held_out = edges.status == HELD_OUT
@@ -74,9 +74,10 @@ def keep_block(folder: Path, block: int, result: Edges) -> None:
 def _reusable(
     candidates: Edges, guesses: Floats, before: Floats, earlier: Edges | None, scale: float, least_spread: float
 ) -> tuple[Ints, Ints]:
-    """Rows of the candidates whose earlier registration stands, and its rows in that table: one that the guesses
-    (P, 4, 4) lie near to, or nearer than those of `before (P, 4, 4)`, and whose clouds hold each other by
-    `least_spread` in all directions.
+    """Rows of the candidates whose earlier registration is kept, and its rows in `earlier`.
+
+    `guesses (P, 4, 4)` are the present ones, `before (P, 4, 4)` those that the earlier registration began at; being
+    nearer than `before` counts only where the information holds translation by `least_spread` in every direction.
     """
     if earlier is None:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -93,12 +94,12 @@ def _reusable(
 
 
 def _apart(registered: Edges, i_from_j: Floats, scale: float) -> Floats:
-    """How far (P,) motions (P, 4, 4) lie from those registered, turns at an arm's length."""
+    """Distance (P,) in metres of motions (P, 4, 4) from those registered; an angle counts as its arc at `se3.ARM_M`."""
     twist = se3.log(se3.inverse(registered.i_from_j) @ i_from_j)
     return np.asarray(np.linalg.norm(twist[:, 3:], axis=1) + se3.ARM_M * scale * np.linalg.norm(twist[:, :3], axis=1))
 
 
 def _is_held(registered: Edges, least_spread: float) -> Bools:
-    """Where (P,) no direction is one that the two clouds may slide in."""
+    """Where (P,) every direction of translation is constrained."""
     weak, _ = weak_directions(registered, least_spread)
     return np.asarray(~weak.any(axis=1))

@@ -1,4 +1,4 @@
-"""Every frame posed anew, each by itself, against the corners of its key frame where the solve has put them."""
+"""Frames between key frames resected, each by itself, against the corners of their solved key frames."""
 
 from __future__ import annotations
 
@@ -17,14 +17,13 @@ from hodge_pipeline.types import Bools, Camera, Floats, Frame, Ints
 from hodge_pipeline.types.arrays import groups
 
 FEWEST_POINTS = 20
-"""That must agree on a pose for it to be believed."""
+"""Inliers that a pose needs."""
 
 
 @dataclass(frozen=True)
 class PosedBlock:
-    """What is known so far of the frames and key frames `rows (R,)` of some sightings: poses (R, 4, 4), whether each
-    `is_key (R,)`, velocities (R, 6), the cameras, by how many seconds colour is later than depth
-    (R,), and the metre in the unit of these lengths.
+    """The frames and key frames `rows (R,)` of a block of sightings: present poses (R, 4, 4), which are key frames
+    `is_key (R,)`, velocities (R, 6), cameras, seconds by which colour is later than depth (R,), length units per metre.
     """
 
     rows: Ints
@@ -38,8 +37,8 @@ class PosedBlock:
 
 @dataclass(frozen=True)
 class Reposed:
-    """Rows (R,) of the frames that were posed anew, their poses (R, 4, 4) and the information (R, 6, 6) on these, over
-    `world_from_cam exp(ξ)`, and the rows of those that fit nothing.
+    """Rows (R,) of the frames resected, their poses (R, 4, 4) and the information (R, 6, 6) on `world_from_cam exp(ξ)`,
+    and the rows of those with too few inliers.
     """
 
     rows: Ints
@@ -49,12 +48,12 @@ class Reposed:
 
 
 def repose_stored(block: tuple[Path, PosedBlock]) -> Reposed:
-    """The frames of a block, posed anew by the sightings in a file."""
+    """The frames of a block, resected by the sightings in a file."""
     return repose(artifacts.load(block[0], Sightings), block[1])
 
 
 def repose(sightings: Sightings, block: PosedBlock) -> Reposed:
-    """The frames of a block, posed anew; key frames stay where the solve has put them."""
+    """The frames of a block, resected; key frames keep their poses."""
     at = {int(row): place for place, row in enumerate(block.rows)}
     seen = _at_stamps(sightings, block, at)
     corners = _solved_corners(sightings, block, at, seen)
@@ -107,7 +106,7 @@ def view_at_stamps(
 
 
 def _solved_corners(sightings: Sightings, block: PosedBlock, at: dict[int, int], seen: Floats) -> Floats:
-    """Corners (C, 3) in the world: the mean of what their own key frame and the others that saw them measured."""
+    """Corners (C, 3) in the world: the mean of their positions as measured by each key frame that saw them."""
     total, count = np.zeros((len(sightings.key), 3)), np.ones(len(sightings.key))
     for row, own in groups(sightings.key):
         place = at[row]

@@ -17,13 +17,13 @@ from hodge_pipeline.types import Bools, Camera, Floats
 PIXEL_SIGMA = 0.75
 """Pixels: of a corner followed by optical flow, on TUM fr1."""
 DEPTH_SIGMAS = 2.0
-"""What `depth_sigma`, the noise of one pixel on a plane, is taken times: corners lie where depth is worst."""
+"""Factor on `depth_sigma`, the noise of one pixel on a plane: corners lie where depth is worst."""
 GATE_PX = 4.0
-"""Pixels beyond which a point is no inlier; also the last scale at which a residual weighs half."""
+"""Reprojection error in pixels of an inlier, at most; depths are gated at as many sigmas."""
 ANNEALED = (8.0, 4.0, 2.0, 1.0, 1.0, 1.0, 1.0)
-"""Cauchy scales of the steps, times its last one: a wrong start may be off by tens of pixels."""
+"""Cauchy scale of each Gauss-Newton step, coarse to fine: a wrong start may be off by tens of pixels."""
 FEWEST = 12
-"""Points of a pose: four are the least, three times as many leave some to disagree."""
+"""Inliers that a pose needs: three times the minimal four."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def resect(
 ) -> Resection | None:
     """The pose that sees points (n, 3) at `seen (n, 3)`, columns u, v, z (NaN: no depth there), from a guess.
 
-    None where fewer than 12 points agree on it. `unit_m` is the metre, in the unit of these lengths.
+    None with fewer than 12 inliers. `unit_m` is the number of length units per metre.
     """
     points, seen = points / unit_m, seen / [1.0, 1.0, unit_m]
     pose = se3.rescaled(known_from_cam, 1 / unit_m)
@@ -66,15 +66,15 @@ def resect(
         pose = pose @ se3.exp(step)
         if scale == 1.0 and np.abs(step).max() < 1e-6:
             break
-    inliers = _agree(points, seen, camera, pose)
+    inliers = _inliers(points, seen, camera, pose)
     if inliers.sum() < FEWEST:
         return None
     return Resection(se3.rescaled(pose, unit_m), se3.rescaled_information(information, unit_m), inliers)
 
 
 def robust_cost(points: Floats, seen: Floats, camera: Camera, known_from_cam: Floats, unit_m: float = 1.0) -> float:
-    """What a pose leaves over, Cauchy's cost at scale 1; inputs as of `resect`. A point behind the camera costs as one
-    at the gate.
+    """Cauchy cost, at scale 1, of the residuals over their sigmas; inputs as of `resect`. A point behind the camera
+    costs as one at the gate.
     """
     pose = se3.rescaled(known_from_cam, 1 / unit_m)
     in_cam, residual = _residuals(points / unit_m, seen / [1.0, 1.0, unit_m], camera, pose)
@@ -89,14 +89,14 @@ def _white(in_cam: Floats, residual: Floats) -> Floats:
 
 
 def _residuals(points: Floats, seen: Floats, camera: Camera, pose: Floats) -> tuple[Floats, Floats]:
-    """Points (n, 3) in the camera, and seen less expected u, v, z; of no depth 0, of a point behind it NaN."""
+    """Points (n, 3) in the camera, and residuals u, v, z (n, 3): z is 0 without depth, all NaN behind the camera."""
     in_cam = (points - pose[:3, 3]) @ pose[:3, :3]
     residual = seen - project(in_cam, camera)
     residual[np.isnan(seen[:, 2]), 2] = 0.0
     return in_cam, residual
 
 
-def _agree(points: Floats, seen: Floats, camera: Camera, pose: Floats) -> Bools:
+def _inliers(points: Floats, seen: Floats, camera: Camera, pose: Floats) -> Bools:
     in_cam, residual = _residuals(points, seen, camera, pose)
     near = np.hypot(residual[:, 0], residual[:, 1]) < GATE_PX
     sigma_z = DEPTH_SIGMAS * depth_sigma(in_cam[:, 2])
@@ -106,8 +106,9 @@ def _agree(points: Floats, seen: Floats, camera: Camera, pose: Floats) -> Bools:
 def focal_evidence(
     points: Floats, seen: Floats, camera: Camera, known_from_cam: Floats, unit_m: float = 1.0
 ) -> tuple[float, float]:
-    """What points say of the logarithm of the focal length, where the pose, with which they fit best, is free: minus
-    half of χ²'s gradient, and their information. The points are of pixels of the same camera.
+    """Gradient −½ dχ²/d log f and information on the logarithm of the focal length, the pose marginalised out.
+
+    Inputs as of `resect`, at the pose of least cost. `points` are back-projected pixels of a camera with the same f.
     """
     points, seen = points / unit_m, seen / [1.0, 1.0, unit_m]
     found = _linearised(points, seen, camera, se3.rescaled(known_from_cam, 1 / unit_m), 1.0)
@@ -134,7 +135,7 @@ def _step(points: Floats, seen: Floats, camera: Camera, pose: Floats, scale: flo
 def _linearised(
     points: Floats, seen: Floats, camera: Camera, pose: Floats, scale: float
 ) -> tuple[Floats, Floats] | None:
-    """Derivatives (7, 3n) by ξ and the focal length's logarithm, and residuals (3n,), all with Cauchy weights."""
+    """Jacobian (7, 3n) by ξ and log f, and residuals (3n,), over their sigmas and with Cauchy weights."""
     in_cam, residual = _residuals(points, seen, camera, pose)
     usable = np.isfinite(residual).all(axis=1)
     if usable.sum() < FEWEST:
@@ -148,7 +149,7 @@ def _linearised(
     gain = np.sqrt(weight) / [PIXEL_SIGMA / camera.fx * z, PIXEL_SIGMA / camera.fy * z, sigma_z]
     u, v, one, none = x / z, y / z, np.ones(len(z)), np.zeros(len(z))
     narrowed = -points[usable] * [1.0, 1.0, 0.0] @ pose[:3, :3]
-    # of a point in a camera that moves by exp(ξ), which moves by −(φ × p + ρ), and of one whose pixel is kept
+    # by ξ = (φ, ρ) a point in the camera moves by −(φ × p + ρ); by log f so that its pixels in both cameras are kept
     moved = [
         [u * y, z + v * y, -y],
         [-z - u * x, -v * x, x],

@@ -27,10 +27,10 @@ MATCHES_PER_SAMPLE = 75.0
 """Matches that count as one independent measurement: they share the errors of lens, shutter and the delay between depth
 and colour. Calibrated on real pairs, as `points_per_sample`."""
 
-RATIO = 0.9
-"""A match is this much nearer than the second nearest of the neighbourhood."""
+GUIDED_RATIO = 0.9
+"""Lowe's ratio for guided matching, where the second nearest descriptor is one of the neighbourhood."""
 FAR = 9.0
-"""Above any squared distance of unit descriptors."""
+"""Above any squared distance of unit descriptors, which is 4 at most."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -107,7 +107,7 @@ class Rgbd:
         return visual is not None and visual.inliers >= self.min_inliers
 
     def _guided(self, target: PreparedFrame, source: PreparedFrame, starts: Sequence[Floats]) -> VisualMotion | None:
-        """The motion that most landmarks agree on near a start, None where too few do or surfaces disagree."""
+        """The motion of most inliers by guided matching from the starts; None with few, or where surfaces disagree."""
         found = [
             self._visual(target, source, guided_match(target, source, start, self.guided_m))
             for start in starts
@@ -119,14 +119,14 @@ class Rgbd:
         return best
 
     def _in_reach(self, target: PreparedFrame, source: PreparedFrame, i_from_j: Floats) -> bool:
-        """Whether ICP can fit as many points as it must: from the guess they lie within its first distance of i."""
+        """Whether enough points of j lie within ICP's coarsest distance of i at the guess to reach `min_fitness`."""
         if min(len(target), len(source)) < MIN_POINTS:
             return False
         return self._within(target, source, i_from_j, max(self.geometry.distances_m)).fitness >= self.min_fitness
 
     def _by_landmarks(self, target: PreparedFrame, source: PreparedFrame, visual: VisualMotion) -> Registration:
-        """Their motion. Its fitness, where it is low, is the other way round if this is larger: a frame that shows what
-        is near and, behind it, what the other did not see shares little with it, but all of the other is in it.
+        """The landmarks' motion with its fitness, the larger of both directions where that of j in i is too low: all of
+        a close-up i lies in a wide view j, but little of j in i.
         """
         found = self._assessed(target, source, visual)
         if found.fitness >= self.min_fitness:
@@ -137,8 +137,8 @@ class Rgbd:
     def _by_surfaces(
         self, target: PreparedFrame, source: PreparedFrame, i_from_j: Floats, hint: VisualMotion | None
     ) -> Registration:
-        """ICP from the guess; where a few landmarks agree and surfaces fit as well there, the mean of both by their
-        information: surfaces that let the motion slide, as floor and wall do, say nothing of it along themselves.
+        """ICP from the guess; its mean with the few landmarks of `hint`, weighted by information, where that fits the
+        surfaces as well: surfaces that slide have no information along themselves.
         """
         found = self.geometry.register(target, source, i_from_j)
         if hint is None or found.correspondences == 0:
@@ -172,7 +172,7 @@ class Rgbd:
 
 
 def _mean_motion(surfaces: Registration, landmarks: VisualMotion) -> VisualMotion:
-    """The motion that both agree on best to first order, and their information together."""
+    """The mean of both motions by their information, to first order, with the sum of the information."""
     total = surfaces.information + landmarks.information
     apart = se3.log(se3.inverse(surfaces.i_from_j) @ landmarks.i_from_j)
     step = np.linalg.solve(total + 1e-9 * np.trace(total) * np.eye(6), landmarks.information @ apart)
@@ -180,7 +180,7 @@ def _mean_motion(surfaces: Registration, landmarks: VisualMotion) -> VisualMotio
 
 
 class PreparedFrame(PreparedCloud):
-    """Adds the landmarks to what the surfaces need."""
+    """A prepared cloud and the frame's landmarks."""
 
     def __init__(self, cloud: PointCloud, neighbours: int, seed: int) -> None:
         super().__init__(cloud, neighbours, seed=seed)
@@ -190,14 +190,14 @@ class PreparedFrame(PreparedCloud):
         self.pixel_rad = np.asarray(landmarks.pixel_rad, np.float64)
 
 
-class Marked(Protocol):
+class WithLandmarks(Protocol):
     """A frame's landmarks (n, 3) in its axes, and their unit descriptors (n, 128)."""
 
     landmarks: Floats
     descriptors: Floats32
 
 
-def guided_match(target: Marked, source: Marked, i_from_j: Floats, within_m: float) -> Ints:
+def guided_match(target: WithLandmarks, source: WithLandmarks, i_from_j: Floats, within_m: float) -> Ints:
     """Rows (M, 2) of landmarks of i and j that are each other's nearest by descriptor among those within `within_m`.
 
     Near a guess a landmark must stand out among its neighbours alone, so that repeated and faint ones match as well.
@@ -212,7 +212,7 @@ def guided_match(target: Marked, source: Marked, i_from_j: Floats, within_m: flo
     nearest = unlike[of_source, columns]
     mutual = (unlike.argmin(axis=1)[of_source] == columns) & (nearest < FAR)
     unlike[of_source, columns] = FAR
-    stands_out = nearest < RATIO**2 * unlike.min(axis=0)
+    stands_out = nearest < GUIDED_RATIO**2 * unlike.min(axis=0)
     kept = np.flatnonzero(mutual & stands_out)
     return np.stack([of_source[kept], kept], axis=1).astype(np.int64)
 

@@ -1,4 +1,4 @@
-"""Scan-to-map tracking of the sweeps of one LiDAR: voxelised GICP, weighed against the velocity so far."""
+"""Scan-to-map tracking of the sweeps of one LiDAR: voxelised GICP, filtered with a constant-velocity model."""
 
 from __future__ import annotations
 
@@ -14,44 +14,43 @@ from hodge_pipeline.registration.sweeps import deskewed
 from hodge_pipeline.types import Floats, PointCloud
 
 START_LEVELS, LEVELS = (9, 3, 1), (3, 1)
-"""Voxels of the map, coarse to fine: the coarsest are for a velocity of 30 m a second that nobody knows yet."""
+"""Sizes of the map's voxels, in finest voxels, coarse to fine: the coarsest catch an unknown velocity of 30 m/s."""
 LOOK_M, SAMPLE_M = 3.0, 0.7
-"""Times a voxel: how far correspondences may be at its level; and the finest voxel thins a sweep."""
+"""Correspondence distance at a level, in its voxels; voxel that a sweep is down-sampled to, in finest voxels."""
 NEIGHBOURS, MOST_ITERATIONS, SWEEPS_KEPT = 10, 30, 100
 """As small_gicp has them: points in a covariance; steps at a level; sweeps until a voxel that no sweep touches goes."""
 FLATTEST = 0.05
-"""Second to first variance of a point's neighbours; below it they lie on a line, such as one ring on the ground, and
-their covariance would show a plane of any direction, which holds the ring where it was seen before.
+"""Ratio of the second to the first variance of a point's neighbours below which they lie on a line, such as one ring
+on the ground: their covariance is a plane of arbitrary direction, which would pull the ring to where it was.
 """
 LOOSE = 0.002
 """Share of the information on translation that its weakest direction has, below which little tells how far the scanner
 went: 0 in a bare tunnel, 0.0013 on a bare field at 16 beams, 0.01 to 0.1 in offices, forests and streets.
 """
 LEAST = 1e-6
-"""Share that every direction keeps, so that the information stays positive."""
+"""Share of the information on translation that every direction keeps, so that the matrix stays positive."""
 UNMATCHED = 9.0
-"""Times the usual squared error: what a point costs that has no voxel near, as one three times as far off."""
+"""Cost of a point without a correspondence, in mean squared errors of the others: as of one three times as far off."""
 ACCELERATION_M_S2, FASTEST_M_S = 5.0, 30.0
-"""Sigmas: of the change of velocity in a second, as of a car that brakes hard; and of a velocity that nobody knows."""
+"""Sigmas of the motion model: of acceleration, as of a car that brakes hard, and of an unknown velocity."""
 SHARED_ERRORS = 30.0
-"""The sigma of a pose, times the one that independent points would give: those of a ring or wall share their errors.
-In a simulated corridor steps of 16 beams scattered by 0.1 m and claimed 3 mm.
+"""Factor on the sigma of a pose that independent points would give: points of a ring or wall share their errors. In a
+simulated corridor steps of 16 beams scattered by 0.1 m and claimed 3 mm.
 """
 MOST_PASSES = 4
-"""How often at most the first sweeps are followed forth and back for their velocity."""
+"""Passes over the first sweeps, forwards and backwards, for their velocity, at most."""
 MOST_DESKEWS, FARTHER = 3, 0.9
 """A sweep is deskewed again while its new velocity moves its farther points, at this quantile, by half a voxel."""
 
 
 class ScanToMap:
-    """Scan to map on one sequence: `pose` is that at the middle of the last sweep, which took `turn_s`, if known;
-    `is_loose` says whether that sweep told little of how far the scanner went.
+    """Scan to map on one sequence: `pose` is that at the middle of the last sweep, which took `turn_s` (0: unknown);
+    `is_loose`: the last alignment hardly constrained translation in some direction.
 
-    Sweeps are deskewed to their middle, where a wrong velocity moves them as little forwards as back. To their first
-    points it would move the next pose the other way by half, which swings for ever.
+    Sweeps are deskewed to their middle, about which the error of a wrong velocity is symmetric: deskewed to their first
+    points, it would move the next pose the other way by half, and the velocity would oscillate.
 
-    What a sweep says of its pose is weighed against the motion so far (a Kalman filter of the velocity): along a
-    corridor the alignment knows little, and a scanner does not leap.
+    A Kalman filter of the velocity combines each alignment with the motion so far, which matters along a corridor.
     """
 
     def __init__(self, voxel_m: float, velocity: Floats, levels: tuple[int, ...] = LEVELS) -> None:
@@ -77,7 +76,7 @@ class ScanToMap:
                 break
             known = np.linalg.eigvalsh(information[3:, 3:])
             self.is_loose = bool(known[0] < LOOSE * known.sum())
-            self.pose, moved = _weighed(predicted, spread * duration**2, self.pose, information)
+            self.pose, moved = _kalman_update(predicted, spread * duration**2, self.pose, information)
             self._spread = moved / duration**2
             velocity = se3.log(se3.inverse(before) @ self.pose) / duration
             rates.append(velocity)
@@ -87,14 +86,14 @@ class ScanToMap:
         self.velocity, self._time_s = velocity, time_s
 
     def _shift_m(self, rates: Floats, points: Floats, seconds: float) -> float:
-        """How far such a velocity moves the farther points in this time."""
+        """Metres by which a velocity moves the farther points, at quantile `FARTHER`, in this time."""
         range_m = np.quantile(np.linalg.norm(points, axis=1), FARTHER)
         return float((np.linalg.norm(rates[:3]) * range_m + np.linalg.norm(rates[3:])) * seconds)
 
 
-def _weighed(predicted: Floats, spread_m2: Floats, aligned: Floats, information: Floats) -> tuple[Floats, Floats]:
-    """The pose between the predicted and the aligned one, and the covariance (3, 3) of its translation."""
-    known = np.eye(6)  # of the prediction: of turns no more is known than their size in radians
+def _kalman_update(predicted: Floats, spread_m2: Floats, aligned: Floats, information: Floats) -> tuple[Floats, Floats]:
+    """The mean, by information, of the predicted and the aligned pose, and the covariance (3, 3) of its translation."""
+    known = np.eye(6)  # information of the prediction; of rotation: a sigma of 1 radian
     known[3:, 3:] = np.linalg.inv(spread_m2)
     both = information + known
     moved = np.asarray(np.linalg.solve(both, information @ se3.log(se3.inverse(predicted) @ aligned)))
@@ -102,10 +101,10 @@ def _weighed(predicted: Floats, spread_m2: Floats, aligned: Floats, information:
 
 
 def first_velocity(voxel_m: float, sweeps: Sequence[tuple[float, PointCloud]]) -> Floats:
-    """The twist a second (6,) at the first of these sweeps, each with its time; they are followed forth and back until
-    it stays.
+    """The twist per second (6,) at the first of these sweeps, each with its time: tracked forwards and backwards until
+    it converges.
 
-    At first from rest: rings on the ground look the same ahead, and give a velocity that is too small.
+    A first pass from rest gives too small a velocity, since rings on the ground look the same ahead.
     """
     velocity = np.zeros(6)
     for _ in range(MOST_PASSES if len(sweeps) > 1 else 0):
@@ -124,14 +123,14 @@ class _Map:
     """Voxels of Gaussians (Koide et al., ICRA 2021) of the sweeps so far, at several sizes, coarse to fine."""
 
     def __init__(self, voxel_m: float, levels: tuple[int, ...]) -> None:
-        self._voxel_m, self._is_empty, self._sweep, self._feigned = voxel_m, True, None, 0.0
+        self._voxel_m, self._is_empty, self._sweep, self._spurious = voxel_m, True, None, 0.0
         self._levels = [(size * voxel_m, small_gicp.GaussianVoxelMap(size * voxel_m)) for size in levels]
         for _, voxels in self._levels:
             voxels.set_lru(horizon=SWEEPS_KEPT)
 
     def align(self, points: Floats, guesses: list[Floats]) -> tuple[Floats, Floats | None]:
-        """The pose of a sweep by points (N, 3) and its information (6, 6), rotation first in its own axes; the first
-        guess and none where nothing could be aligned.
+        """The pose of a sweep by points (N, 3) and its information (6, 6), rotation first, in its own axes; the first
+        guess and None where it could not be aligned.
         """
         self._sweep = self._thinned(points) if len(points) >= MIN_POINTS else None
         if self._sweep is None or self._sweep.size() < MIN_POINTS or self._is_empty:
@@ -145,7 +144,7 @@ class _Map:
         count = self._sweep.size()
         best = min(held, key=lambda one: one.error + (count - one.num_inliers) * UNMATCHED * usual)
         information = np.asarray(best.H) / (SHARED_ERRORS**2 * max(usual, 1e-12))
-        return np.asarray(best.T_target_source), _without_feigned(information, self._feigned)
+        return np.asarray(best.T_target_source), _without_spurious(information, self._spurious)
 
     def _coarse(self, guess: Floats) -> Floats:
         for level in self._levels[:-1]:
@@ -172,10 +171,10 @@ class _Map:
         self._is_empty = False
 
     def _thinned(self, points: Floats) -> Any:
-        """One point a voxel with its covariance, without those whose neighbours lie on a line.
+        """One point per voxel with its covariance, without those whose neighbours lie on a line.
 
-        Normals of the others are known to a variance of λ3 / (λ2 k) of k neighbours, which feigns that share of the
-        information along a bare wall: 0.4 % in a tunnel at 16 beams, where alignment would stop the scanner.
+        Normals from k neighbours have a variance of λ3 / (λ2 k), and this share of the information along a bare wall is
+        spurious: 0.4 % in a tunnel at 16 beams, where alignment would stop the scanner.
         """
         sweep = small_gicp.voxelgrid_sampling(points, SAMPLE_M * self._voxel_m)
         sampled = np.asarray(sweep.points())[:, :3]
@@ -187,16 +186,16 @@ class _Map:
             is_flat = variances[:, 1] > FLATTEST * variances[:, 2]
             if is_flat.sum() > NEIGHBOURS:
                 sweep = small_gicp.PointCloud(sampled[is_flat])
-                self._feigned = float(np.mean(variances[is_flat, 0] / variances[is_flat, 1])) / NEIGHBOURS
+                self._spurious = float(np.mean(variances[is_flat, 0] / variances[is_flat, 1])) / NEIGHBOURS
         small_gicp.estimate_covariances(sweep, None, NEIGHBOURS)
         return sweep
 
 
-def _without_feigned(information: Floats, feigned: float) -> Floats:
-    """The information (6, 6), less this share of that on translation in every direction."""
+def _without_spurious(information: Floats, share: float) -> Floats:
+    """The information (6, 6), less this share of the total on translation in every direction of translation."""
     values, vectors = np.linalg.eigh(information[3:, 3:])
     total = values.sum()
-    held = np.maximum(values - feigned * total, LEAST * total) / np.maximum(values, LEAST * total)
+    held = np.maximum(values - share * total, LEAST * total) / np.maximum(values, LEAST * total)
     scale = np.eye(6)
     scale[3:, 3:] = vectors * np.sqrt(held) @ vectors.T
     return np.asarray(scale @ information @ scale)

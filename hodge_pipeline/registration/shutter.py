@@ -1,4 +1,4 @@
-"""Rolling shutter: where points would have been seen had all of an image been taken at the moment of its frame.
+"""Rolling shutter: points moved to where they would have been seen at the stamp of their frame.
 
 A camera reads its rows one after the other, and its colour image is rarely of the same moment as its depth image. With
 the camera's velocity from the frames around, each point is moved to where it was at the frame's own stamp.
@@ -13,14 +13,14 @@ from hodge_pipeline.registration.resection import project
 from hodge_pipeline.types import Bools, Camera, Floats, Ints
 
 LONGEST_SPAN_S = 0.5
-"""Between the two frames that a velocity is taken from: a hand-held camera turns back within half a second."""
+"""Longest time between the two frames of a velocity: a hand-held camera turns back within half a second."""
 
 
 def velocities(world_from_cam: Floats, times_s: Floats, sequence: Ints, found: Bools) -> Floats:
-    """Twists (N, 6) a second in each camera's axes, from the frames before and after it, or from one of them; where one
-    of these has no pose of its own, from the next but one.
+    """Twists (N, 6) per second in each camera's axes, by differences between its neighbours in the `sequence (N,)`.
 
-    Zero where a frame has no neighbour near in time with a pose of its own.
+    A neighbour without a pose of its own (`found (N,)`) is replaced by the next but one, or by the frame itself; zero
+    where that leaves no two frames within `LONGEST_SPAN_S`.
     """
     rows = np.arange(len(times_s))
 
@@ -39,17 +39,18 @@ def velocities(world_from_cam: Floats, times_s: Floats, sequence: Ints, found: B
 
 
 def at_frame_stamp(points_in_cam: Floats, camera: Camera, colour_delay_s: float, twist: Floats) -> Floats:
-    """Points (n, 3), their pixels of the colour image and their depths of the depth image, at the frame's stamp.
+    """Points (n, 3) in the camera's axes at the frame's stamp, from points (n, 3) back-projected from pixels of the
+    colour image and depths of the depth image.
 
-    `twist (6,)` is the camera's velocity in its own axes, `colour_delay_s` how much later the middle row of its colour
-    image was taken than that of its depth image, whose moment the frame's stamp is. Both shutters roll alike.
+    `twist (6,)` is the camera's velocity in its own axes. The stamp is that of the depth image's middle row; the colour
+    image's is `colour_delay_s` later. Both have the same rolling shutter.
     """
     if not (camera.readout_s or colour_delay_s) or not twist.any():
         return points_in_cam
     row = project(points_in_cam, camera)[:, 1]
-    after_depth_s = camera.readout_s * (row / camera.height - 0.5)
+    row_delay_s = camera.readout_s * (row / camera.height - 0.5)
     velocity = -(np.cross(twist[:3], points_in_cam) + twist[3:])
     z = points_in_cam[:, 2]
     at_colour = points_in_cam * (1 + velocity[:, 2] * colour_delay_s / z)[:, None]
-    moved = at_colour - velocity * (colour_delay_s + after_depth_s)[:, None]
+    moved = at_colour - velocity * (colour_delay_s + row_delay_s)[:, None]
     return np.asarray(np.where(np.isfinite(moved), moved, points_in_cam))

@@ -1,4 +1,4 @@
-"""Where frames saw the corners of their key frames: what every frame is posed by once the key frames are solved."""
+"""Where frames saw the corners of their key frames, for resecting every frame once the key frames are solved."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from hodge_pipeline.types import Floats, Ints
 from hodge_pipeline.types.arrays import evenly, groups
 
 MOST_BLOCKS = 10
-"""That views are taken of, evenly spread."""
+"""Files that `views` reads, evenly spread."""
 FEWEST_CORNERS = 60
-"""Of a view."""
+"""Corners that a view needs."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Sightings:
 
     @classmethod
     def of(cls, found: Mapping[tuple[int, int], Followed], points: Mapping[int, Floats], rows: Ints) -> Sightings:
-        """The columns of what was found at (key frame's place, frame's place) in a block of these rows; `points (n, 3)`
-        are the corners of the key frame at a place.
+        """The sightings `found` at (key frame's place, frame's place) in a block of these rows; `points (n, 3)` are the
+        corners of the key frame at a place.
         """
         pairs = sorted(found)
         keys = sorted({key for key, _ in pairs})

@@ -20,31 +20,31 @@ from hodge_pipeline.one_blas_thread import one_blas_thread
 from hodge_pipeline.types import Floats
 
 VIDEO_STEP_S = 0.2
-"""Between two frames of a video, at most. Of 2 mm of noise put on true paths of hands and of a drone half is left at
-30 Hz, and no more than there was down to 5 Hz; at 3 Hz turning to and fro looks like noise. Tracking agrees: fr1/rpy's
-every third frame, 0.1 s, is tracked well; key frames 0.7 s apart are not.
+"""Longest step between frames of a video. Of 2 mm of noise on true paths of hands and of a drone smoothing leaves half
+at 30 Hz and adds none down to 5 Hz; at 3 Hz it takes turning to and fro for noise. Tracking agrees: fr1/rpy's every
+third frame, 0.1 s, is tracked well; key frames 0.7 s apart are not.
 """
 FEWEST = 10
 """Frames of a run: fewer hardly tell acceleration from errors."""
 ROUNDS = 3
-"""In which frames are weighed anew by what they are off: a blurred one errs by much more than it says."""
+"""Of reweighting frames by their residuals: a blurred one errs by much more than its covariance."""
 COARSE, FINE = np.arange(-12.0, 13.0, 4.0), (2.0, 1.0, 0.5)
-"""Logarithms of weights that are tried, each of rotation with each of translation: a path in which a hand turns to and
-fro may be likely as noise too; and steps from the likeliest of these.
+"""Logarithms of the weights of rotation and of translation: a grid, since the likelihood may have several optima, and
+the step sizes of a pattern search from its best node.
 """
 LEAST_COST = 1e-12
-"""Of a path that needs no move at all, as that of a camera at rest."""
+"""Floor of the cost: a camera at rest needs no move at all."""
 ORDER = 2
-"""Of the derivative that is noise."""
+"""Order of the derivative that is white noise: the acceleration."""
 BAND = 6 * ORDER
-"""Above the diagonal of the normal equations, of six numbers a frame."""
+"""Bands above the diagonal of the normal equations, with six unknowns a frame."""
 
 
 @one_blas_thread
 def smoothed(world_from_cam: Floats, information: Floats, times_s: Floats) -> Floats:
-    """The poses (n, 4, 4) of one unbroken run of frames, smoothed.
+    """The poses (n, 4, 4) of one unbroken run of frames, smoothed; as they are with fewer than `FEWEST` frames.
 
-    `information (n, 6, 6)` of each is over `world_from_cam exp(ξ)`, but for one factor; `times_s (n,)` ascend.
+    `information (n, 6, 6)` of each is over `world_from_cam exp(ξ)`, up to a common factor; `times_s (n,)` ascend.
     """
     if len(world_from_cam) < FEWEST:
         return world_from_cam
@@ -63,8 +63,8 @@ def smoothed(world_from_cam: Floats, information: Floats, times_s: Floats) -> Fl
 
 @dataclass(frozen=True)
 class _Solved:
-    """Moves (n, 6) in axes parallel to the world's, the variance of errors in units of the information's inverse, and
-    the log-likelihood, times −2, but for a constant.
+    """Moves (n, 6) in axes parallel to the world's, the factor on the covariances, and −2 log-likelihood up to a
+    constant.
     """
 
     moves: Floats
@@ -74,9 +74,9 @@ class _Solved:
 
 @dataclass(frozen=True)
 class _Path:
-    """A run of frames: `information (n, 6, 6)` in axes parallel to the world's, `differences (n - 2, 3)` what gives
-    the acceleration at each inner frame of three frames' numbers, in units of its standard deviation, `bent (n - 2, 6)`
-    the acceleration as it is, and the `unit (2,)` of the weights, of rotation and of translation.
+    """A run of frames: `information (n, 6, 6)` in axes parallel to the world's, `differences (n - 2, 3)` the finite
+    differences of `_differences`, `bent (n - 2, 6)` the acceleration of the given poses, `unit (2,)` that of the
+    weights on rotation and on translation.
     """
 
     information: Floats
@@ -100,7 +100,7 @@ class _Path:
 
     @cached_property
     def _smoothing(self) -> Floats:
-        """Of each number, the bands that a weight of one gives: of the frame and of each that follows."""
+        """Bands (3, n) of one unknown's normal equations for a weight of one: its diagonal and the two beside it."""
         bands, inner, each = np.zeros((ORDER + 1, len(self.information))), len(self.differences), self.differences.T
         for first in range(ORDER + 1):
             for later in range(first, ORDER + 1):
@@ -118,7 +118,7 @@ class _Path:
         return bands.reshape(BAND + 1, -1)
 
     def solve(self, weight: Floats, logs: Floats) -> _Solved:
-        """With weights (n,) of the frames and the logarithms (2,) of those on accelerations, over their unit."""
+        """The smoothed path by weights (n,) of frames and the logarithms (2,) of those on acceleration, in `unit`."""
         smooth = np.repeat(np.exp(logs) * self.unit, 3)
         factor = cholesky_banded(self._bands(weight, smooth))
         pull = np.zeros((len(weight), 6))
@@ -133,7 +133,7 @@ class _Path:
         return _Solved(moves, cost / numbers, numbers * float(np.log(cost)) + log_det)
 
     def likeliest(self, weight: Floats, logs: Floats | None) -> Floats:
-        """The logarithms (2,) of the weights on accelerations that make the path likeliest, near those of before."""
+        """The likeliest logarithms (2,) of the weights on acceleration; a local search where `logs` is given."""
 
         def unlikeliness(logs: Floats) -> float:
             return self.solve(weight, np.clip(logs, COARSE[0], COARSE[-1])).unlikeliness
@@ -147,7 +147,7 @@ class _Path:
 
 
 def _differences(times: Floats) -> Floats:
-    """What gives the derivative (n - ORDER, ORDER + 1) of so many consecutive numbers, in units of its deviation."""
+    """Finite-difference coefficients (n - ORDER, ORDER + 1) of the derivative, over its standard deviation as noise."""
     near = np.lib.stride_tricks.sliding_window_view(times, ORDER + 1)
     apart = near[:, :, None] - near[:, None, :] + np.eye(ORDER + 1)
     return np.asarray(np.sqrt((near[:, -1:] - near[:, :1]) / ORDER) / apart.prod(axis=2))

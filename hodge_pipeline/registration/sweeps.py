@@ -1,4 +1,4 @@
-"""Sweeps of a scanner that turns while it moves, as if it had stood still: constant velocity within one revolution."""
+"""Deskewing of the sweeps of a spinning scanner, with constant velocity within one revolution."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ STEPS_A_SWEEP = 64
 
 
 def deskewed(cloud: PointCloud, velocity: Floats, after_s: float = 0.0) -> PointCloud:
-    """The points as seen from where the scanner was `after_s` seconds after the first, for one that moves at
-    `velocity (6,)`, a twist a second in its own axes. As it is where the times of points are unknown.
+    """The points as seen from the scanner's pose `after_s` seconds after the first point; unchanged without times.
+
+    `velocity (6,)` is the scanner's twist per second in its own axes.
     """
     if cloud.times_s is None or not len(cloud):
         return cloud

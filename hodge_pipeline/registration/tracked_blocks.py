@@ -1,4 +1,4 @@
-"""Tracked blocks, also on disk: a killed run goes on with the next one; the clouds of all are joined file by file."""
+"""Tracked blocks in memory and on disk, from which a killed run goes on; their clouds are joined file by file."""
 
 from __future__ import annotations
 
@@ -30,14 +30,17 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class BlockRows:
-    """What became of a block's rows: its key frames but one that the block before has too, the steps from each to the
-    next, and for every row the row of the key frame that it was followed from, the motion, and its fitness: NaN where
-    the motion is a guess; and the rows `moving` of frames much of which moved otherwise than the camera, `doubtful` of
-    those whose motion may be that of an object, `blank` of those that have depth but show nothing, and `apart` of those
-    of these whose key frame flow joins with the next one: they do not share the error of that step; and the rows
-    `unread` of frames whose images cannot be read, and why.
+    """How the rows of a block were tracked. Its last row is the first of the next block.
 
-    A step of fitness 0 is a guess too. The block's last row is the first of the next one.
+    - `keys`: the key frames, but for a first one that belongs to the block before; `steps`: from each key frame to the
+      next, guessed where the fitness is 0.
+    - `rows (R,)`, `anchors (R,)`, `key_from_row (R, 4, 4)`, `fitness (R,)`: each row, the row of its key frame, the
+      motion, and its fitness, NaN where the motion is guessed.
+    - `moving`: rows of frames in which much moves otherwise than the camera; `doubtful`: whose motion may be an
+      object's.
+    - `blank`: rows of frames with depth and a blank image; `apart`: those of them registered by clouds to a key frame
+      that optical flow joins with the next one, so that they do not share the error of that step.
+    - `unread`: rows of frames whose images cannot be read; `unread_why`: the errors.
     """
 
     keys: Ints
@@ -57,7 +60,7 @@ class BlockRows:
 
 @dataclass(frozen=True)
 class TrackedBlock(BlockRows):
-    """These, with the key frames' clouds, and what the frames saw of the key frames' corners."""
+    """A block with its key frames' clouds and its sightings."""
 
     clouds: tuple[PointCloud, ...]
     sightings: Sightings
@@ -71,7 +74,7 @@ class TrackedBlocks:
         self._folder = folder
 
     def finished(self) -> set[int]:
-        """The numbers of the blocks that are there, but for those that an earlier version wrote with fewer columns."""
+        """The numbers of the blocks on disk, without those that an earlier version wrote with fewer columns."""
         return {int(path.stem) for path in self._folder.glob("[0-9]*.npz") if _is_whole(path)}
 
     def write(self, number: int, block: TrackedBlock) -> None:
@@ -92,7 +95,7 @@ class TrackedBlocks:
             return BlockRows(steps=steps, notes=tuple(stored["notes"].tolist()), **columns)
 
     def keep_sightings(self, folder: Path) -> None:
-        """Write what the frames of each block saw of their key frames' corners into a folder, a file for each block."""
+        """Write the sightings of all blocks into a folder, a file for each block."""
         for path in sorted(self._folder.glob("[0-9]*.npz")):
             with np.load(path) as stored:
                 arrays = {field.name: stored[SIGHTING + field.name] for field in fields(Sightings)}

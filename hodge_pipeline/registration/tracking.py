@@ -32,15 +32,15 @@ LONGEST_GUESS = 4.0
 FEWEST_FOLLOWED = 25
 """Corners that must agree on a motion for it to be believed; below it clouds are registered."""
 FEW_FOLLOWED, SMALL_SHARE = 60, 0.35
-"""Corners, and share of the key frame's, below which the next frame is followed from this one."""
+"""Inliers, and share of the key frame's corners, below which a frame becomes a key frame."""
 DOUBTFUL = 0.25
-"""Share of the image that contradicts a motion, or moves otherwise, from which the motion may be an object's. Of two
-motions that of most of the image is taken, so that at a half either may be the camera's.
+"""Share of the image that contradicts a motion, or follows another, above which the motion may be an object's: that of
+most of the image is taken, so that at a half either may be the camera's.
 """
 MISPLACED = 0.2
-"""Share of the image that does not lie where flow's motion puts it, from which the motion of the clouds is tried, and
-taken where it halves that. Of a bare room whose corners lie on an object, half of the frames have 0.6 and more; 3 in 4
-of red kitchen's and of fr1/rpy's, where nothing moves, less than 0.15.
+"""Share of pixels whose depth contradicts the motion by optical flow, above which the clouds are registered, and their
+motion taken where it halves that share. Of a bare room whose corners lie on an object, half of the frames have 0.6 and
+more; 3 in 4 of red kitchen's and of fr1/rpy's, where nothing moves, less than 0.15.
 """
 CORNERS_A_SAMPLE = 75.0
 """Corners that count as one independent measurement, as matches of landmarks do."""
@@ -104,7 +104,7 @@ class _View:
 
     @cached_property
     def image(self) -> FlowImage | None:
-        """None of a frame that flow cannot follow; where its images cannot be read, `unread` says why."""
+        """The image for optical flow, None where it lacks colour, depth or camera, or cannot be read (see `unread`)."""
         clouds = self._options.clouds
         try:
             return flow_image(self._frame, (clouds.min_range_m, clouds.max_range_m), clouds.unit_m)
@@ -226,7 +226,7 @@ class _Tracker:
         before = self._view(0)
         found = self._flowed(start, before, np.eye(4))
         step = found or self._registrar.register(start.prepared, before.prepared, np.eye(4))
-        if self._good(step):
+        if self._is_good(step):
             start.twist = self._velocity = -se3.log(step.i_from_j) / self._duration(0, start.place)
 
     def _begin(self, view: _View) -> None:
@@ -254,7 +254,7 @@ class _Tracker:
             found = self._flowed_from_last(view)
         if found is None:
             found = self._registered_by_clouds(view)
-        if not self._good(found):
+        if not self._is_good(found):
             self._lose(view, is_last)
             return
         seconds = self._duration(self._last.place, view.place)
@@ -266,8 +266,8 @@ class _Tracker:
             self._promote(view, found)
 
     def _flowed(self, key: _View, view: _View, guess: Floats) -> Registration | None:
-        """The motion by optical flow, None where it finds none; what the view saw is kept. The motion of the clouds
-        where these fit most of the image better: the corners of a bare room lie on what moves.
+        """The motion by optical flow, its inliers kept as sightings; None where it fails; that of the clouds where this
+        fits the depth much better, as in a bare room whose corners lie on a moving object.
         """
         if key.corners is None or key.image is None or view.image is None:
             return None
@@ -280,7 +280,7 @@ class _Tracker:
         off = misplaced(key.image, view.image, found.key_from_view, self._moments(key, view, found.key_from_view))
         if off > MISPLACED:
             by_clouds = self._registrar.register(key.prepared, view.prepared, guess)
-            if self._good(by_clouds) and 2 * misplaced(key.image, view.image, by_clouds.i_from_j) < off:
+            if self._is_good(by_clouds) and 2 * misplaced(key.image, view.image, by_clouds.i_from_j) < off:
                 self._doubt(view, max(contradicting(key.image, view.image, by_clouds.i_from_j), key.left_out))
                 return by_clouds
         self._doubt(view, max(against, key.left_out))
@@ -290,8 +290,8 @@ class _Tracker:
         return Registration(found.key_from_view, information, found.share, found.rmse_m, len(found.rows), 1, True)
 
     def _of_most_area(self, key: _View, view: _View, found: Followed, guess: Floats) -> tuple[Followed, float]:
-        """The motion found, or another one that more of the image follows, and the share that contradicts it; what
-        moves leaves the key frame's cloud.
+        """The motion found, or another that more of the image follows, and the share that contradicts it; the depth of
+        what moves is removed from the key frame.
         """
         assert key.corners is not None and view.image is not None
         moments = self._moments(key, view, found.key_from_view)
@@ -305,7 +305,9 @@ class _Tracker:
         return found, against
 
     def _moments(self, key: _View, view: _View, key_from_view: Floats) -> Moments:
-        """How both cameras moved, the view's from the last frame tracked to it; at rest where none was."""
+        """Velocities and delays of both frames, the view's by its motion since the last frame tracked; at rest before
+        the first key frame.
+        """
         if not self._keys:
             return AT_REST
         key_from_last = self._key_from_last if key is self._keys[-1] else np.eye(4)
@@ -336,22 +338,22 @@ class _Tracker:
         found = self._registered(self._keys[-1], view, self._key_from_last)
         if found.fitness < self._options.kept_fitness and self._last.place != self._keys[-1].place:
             found = self._from_last(view, found)
-        if not self._good(found) and self._missed is not None:
+        if not self._is_good(found) and self._missed is not None:
             found = self._from_missed(view, self._missed, found)
         return found
 
     def _from_last(self, view: _View, to_key: Registration) -> Registration:
         """The view seen from the last frame tracked, which becomes a key frame, where these two share more."""
         found = self._registered(self._last, view, np.eye(4))
-        if found.fitness <= to_key.fitness or not self._good(found):
+        if found.fitness <= to_key.fitness or not self._is_good(found):
             return to_key
         self._promote(self._last, self._step_to_last())
         return found
 
     def _from_missed(self, view: _View, missed: _View, to_key: Registration) -> Registration:
-        """Two frames that know each other but not the key frame: tracking is lost, and begins anew with the first."""
+        """The motion from the frame lost before, which becomes a key frame by a guess, where these two register."""
         found = self._registrar.register(missed.prepared, view.prepared, np.eye(4))
-        if not self._good(found):
+        if not self._is_good(found):
             return to_key
         self._promote(missed, self._guessed(missed))
         return found
@@ -378,7 +380,7 @@ class _Tracker:
             step = again if again.fitness > step.fitness else step
         return step
 
-    def _good(self, step: Registration) -> bool:
+    def _is_good(self, step: Registration) -> bool:
         return step.fitness >= self._limits.min_fitness
 
     def _ahead(self, view: _View) -> Floats:

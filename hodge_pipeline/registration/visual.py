@@ -19,11 +19,11 @@ FEWEST_MATCHES = 8
 PIXEL_SIGMA = 0.75
 """Pixels: a feature's own error, once the shutter's is taken out, on TUM fr1."""
 DEPTH_SIGMAS = 2.0
-"""What `depth_sigma`, the noise of one pixel on a plane, is taken times: features lie where depth is worst."""
+"""Factor on `depth_sigma`, the noise of one pixel on a plane: features lie where depth is worst."""
 GATE = 3.0
-"""Standard deviations, in each of three axes, at which a match stops to count."""
+"""Standard deviations of an inlier, at most, in each of three axes."""
 GATE_PIXEL_SIGMA = 1.5
-"""Pixels: what a match may err by and still be right, blur and a camera that turns fast included."""
+"""Pixels: sigma of an inlier's error for the gate, blur and a camera that turns fast included."""
 STEPS = 8
 ON_A_LINE = 1e-6
 """Area of a triangle, over the square of its size, below which rounding decides on its plane."""

@@ -1,4 +1,4 @@
-"""What follows from a diagnosis for a person: the order to look at the edges in, and what to do about each."""
+"""Advice after a diagnosis: the edges in the order of their urgency, and what to do about each."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from hodge_pipeline.types.text import UNKNOWN_UNIT
 
 ORDER = (WRONG, SUSPECT, UNTESTABLE, CONSISTENT)
 SPLITS = 1 - 1e-6
+"""Leverage from which an edge is a bridge of the graph."""
 
 
 def ranked(diagnosis: Diagnosis) -> Ints:
@@ -38,7 +39,7 @@ def _advice(verdict: str, is_disabled: bool, is_harmless: bool, in_no_listed_cyc
     if is_disabled:
         return "is disabled; nothing speaks against it: enable it again" if verdict == CONSISTENT else "is disabled"
     if verdict == WRONG:
-        return "nothing: no pose hangs on it" if is_harmless else "disable it"
+        return "nothing: no pose depends on it" if is_harmless else "disable it"
     if verdict == SUSPECT:
         return "look at it; disable it where the views do not meet"
     if verdict == UNTESTABLE:
@@ -51,5 +52,5 @@ def _advice(verdict: str, is_disabled: bool, is_harmless: bool, in_no_listed_cyc
 
 
 def in_unit(sentence: str, has_metres: bool) -> str:
-    """A sentence of a diagnosis, which speaks of metres, with the unit that its lengths have."""
+    """A sentence of a diagnosis, with its metres renamed where the unit of lengths is unknown."""
     return sentence if has_metres else re.sub(r"(?<=\d) m\b", f" {UNKNOWN_UNIT}", sentence)

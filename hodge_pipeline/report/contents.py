@@ -20,7 +20,7 @@ from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.positions import PositionFit
 
 NOTHING_TO_DO_M = 0.005
-"""A change of poses in a room that nobody need act on: a quarter of the voxel that clouds are thinned to."""
+"""Change of poses in a room that may be ignored: a quarter of the voxel of clouds."""
 
 
 @dataclass(frozen=True)
@@ -122,8 +122,8 @@ class ComponentRow:
 
 @dataclass(frozen=True)
 class WrongEdges:
-    """The edges judged wrong that the solver used: how many, at which frames most, and what they do: without them
-    poses move by up to `moved_m`, aligned, and the scene has `pieces_more`.
+    """The edges judged wrong that the solver used: how many, at which frames most, and their effect: a solve without
+    them moves poses by up to `moved_m`, aligned, and leaves `pieces_more` components more.
     """
 
     count: int
@@ -192,7 +192,7 @@ class Path3D:
 
 @dataclass(frozen=True)
 class Residuals:
-    """Residuals (E,) of all edges under one set of poses, in metres and radians."""
+    """Residuals (E,) of all edges at one set of poses, in metres and radians."""
 
     name: str
     translation_m: Floats
@@ -221,7 +221,7 @@ class Pictures:
 
     @classmethod
     def of_graph(cls, sets: Mapping[str, Floats], graph: ViewGraph, component: Ints) -> Pictures:
-        """The paths of these sets of poses, and what they leave of a graph's edges."""
+        """The paths of these sets of poses, and the residuals of a graph's edges at them."""
         residuals = tuple(Residuals(name, *edge_residuals(graph, poses)) for name, poses in sets.items())
         return cls(paths_of(sets), component, residuals, graph)
 

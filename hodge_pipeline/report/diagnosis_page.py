@@ -34,7 +34,7 @@ class EdgePictures:
 
 @dataclass(frozen=True)
 class PageContents:
-    """What the page is made of. `advice` has a line for each edge; `commands` are what to type next."""
+    """The contents of the page. `advice` has a line for each edge; `commands` are what to type next."""
 
     title: str
     path: str
@@ -154,10 +154,11 @@ def edge_table(contents: PageContents) -> Table:
     rows = tuple(_edge_row(contents, int(row)) for row in ranked(diagnosis)[:LISTED])
     caption = (
         f"The worst {len(rows)} of {graph.edge_count} edges; edges.csv has all of them. Right: the probability that "
-        "the edge is right. Off by: distance from the robust poses, where its ends lie in one piece. Say: its share in "
-        "where its ends lie; at 100 % the scene falls apart without it. Cycles: the product of motions around them."
+        "the edge is right. Off by: distance from the robust poses, where its ends lie in one piece. Leverage: its "
+        "share in the relative pose of its ends; at 100 % the scene falls apart without it. Cycles: the product of "
+        "motions around them."
     )
-    header = ("edge", "verdict", "what to do", "cycles against", "cycles for", "source", "right", "off by", "say")
+    header = ("edge", "verdict", "what to do", "cycles against", "cycles for", "source", "right", "off by", "leverage")
     return Table("Edges, the worst first", header, rows, caption, 6, wide=(3, 4))
 
 
@@ -191,7 +192,7 @@ def _cycles(contents: PageContents, rows: Ints) -> str:
 
 
 def _without_cycle(contents: PageContents, row: int) -> str:
-    """What speaks against an edge where no cycle is listed, such as a backbone."""
+    """The reason for the verdict on a bad edge without a listed cycle, such as a backbone."""
     is_bad = contents.diagnosis.verdict[row] in (WRONG, SUSPECT)
     return in_unit(contents.diagnosis.reason[row], contents.has_metres) if is_bad else "none"
 
@@ -215,7 +216,7 @@ def _suggestions(contents: PageContents) -> Iterator[Section]:
         "Pairs without an edge, ranked by what one would tell: the uncertainty it would take away, and the untestable "
         "edges it would put into a triangle. Resistance: variance between the two, in units of one edge's."
     )
-    header = ("pair", "why", "nats", "resistance", "edges it tests")
+    header = ("pair", "why", "score, nats", "resistance", "edges it tests")
     yield Section.of(Table("Pairs to register next", header, tuple(rows), caption, 2))
 
 

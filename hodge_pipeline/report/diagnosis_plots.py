@@ -78,7 +78,7 @@ def _legend(figure: Figure, axes: Any) -> None:
 
 def _above(figure: Figure, graph: ViewGraph, diagnosis: Diagnosis, unit: str) -> None:
     axes = figure.add_subplot()
-    positions = side_by_side(diagnosis.world_from_cam, diagnosis.piece)[:, :3, 3]
+    positions = pieces_apart(diagnosis.world_from_cam, diagnosis.piece)[:, :3, 3]
     origin, plane = flattest_plane(positions)
     places = (positions - origin) @ plane.T
     for name in (CONSISTENT, UNTESTABLE, SUSPECT, WRONG):
@@ -100,8 +100,8 @@ def _rarity(count: int) -> float:
     return min(1.0, FEW / max(count, 1))
 
 
-def side_by_side(world_from_cam: Floats, piece: Ints) -> Floats:
-    """The poses (V, 4, 4) with the pieces moved apart along x, so that none lies upon another; the largest stays."""
+def pieces_apart(world_from_cam: Floats, piece: Ints) -> Floats:
+    """The poses (V, 4, 4) with the components moved apart along x for a drawing; the largest stays."""
     placed = np.array(world_from_cam)
     first = placed[piece == 0, :3, 3]
     gap = max(GAP_SHARE * float(np.ptp(first, axis=0).max()), 0.1) if len(first) else 0.1

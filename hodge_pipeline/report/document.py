@@ -1,4 +1,4 @@
-"""What every page is made of, and the one template that shows it: a page that needs nothing but itself."""
+"""The parts of a page, and the template that renders them as one self-contained HTML file."""
 
 from __future__ import annotations
 

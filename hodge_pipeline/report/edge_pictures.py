@@ -1,8 +1,8 @@
-"""Pictures of single edges: their two clouds before and after, cut open, and their two images with what matches."""
+"""Pictures of single edges: their two clouds by the edge and by the robust poses, and their images with matches."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -19,13 +19,12 @@ from hodge_pipeline.report.diagnosis_page import EdgePictures
 from hodge_pipeline.report.document import Picture
 from hodge_pipeline.report.painting import painted
 from hodge_pipeline.report.photographs import images_of
-from hodge_pipeline.report.raster import GAP, beside
 from hodge_pipeline.types import Bytes, CloudSet, Floats, Floats32, Frame, Ints, PointCloud, ViewGraph
 from hodge_pipeline.types.text import UNKNOWN_UNIT
 
 IMAGE_WIDTH = 420
 LEAST_UP = 0.1
-"""Of the mean up direction: where cameras look every way there is none."""
+"""Length of the mean up direction (3,) below which there is none: cameras look every way."""
 SIZE = 360, 270
 STRAY_PERCENT = 1.0
 BLUE, ORANGE = (0, 114, 178), (230, 120, 0)
@@ -34,9 +33,12 @@ CUT_SHARE, SEEN_SHARE = 0.04, 0.03
 EXAGGERATIONS = (2, 5, 10, 20, 50, 100)
 
 RATIO = 0.8
+"""Lowe's ratio (2004)."""
 MAX_FEATURES = 1000
 MAX_ERROR_PX = 2.0
+"""Distance of an inlier from its epipolar line, at most."""
 FEWEST = 8
+"""Matches that a fundamental matrix needs."""
 ODD_COLOUR, AGREEING_COLOUR = (160, 160, 160), (0, 158, 115)
 
 
@@ -50,10 +52,9 @@ def edge_pictures(
     has_metres: bool = True,
 ) -> tuple[EdgePictures, ...]:
     """The pictures of these edges; nothing for a graph without frames or clouds. `has_metres`: as of a `Report`."""
-    said = length if has_metres else "{:.3g} units".format
     scans, found = clouds is not None and is_scanner(clouds), []
     for row in map(int, rows):
-        plots = tuple(_plots(graph, diagnosis, row, frames, clouds, said, scans=scans))
+        plots = tuple(_plots(graph, diagnosis, row, frames, clouds, has_metres=has_metres, scans=scans))
         if plots:
             found.append(EdgePictures(row, plots))
     return tuple(found)
@@ -65,8 +66,8 @@ def _plots(
     row: int,
     frames: Sequence[Frame],
     clouds: CloudSet | None,
-    said: Callable[[float], str],
     *,
+    has_metres: bool,
     scans: bool,
 ) -> Iterator[Picture]:
     i, j = graph.edges[row].tolist()
@@ -78,7 +79,7 @@ def _plots(
         if diagnosis.piece[i] == diagnosis.piece[j]:
             robust = se3.inverse(diagnosis.world_from_cam[i]) @ diagnosis.world_from_cam[j]
             known.append(("As the robust poses say", robust))
-            yield _cut(clouds[i], clouds[j], measured, robust, up, names[1], said)
+            yield _cut(clouds[i], clouds[j], measured, robust, up, names[1], has_metres=has_metres)
         views = _views(clouds[i], clouds[j], [motion for _, motion in known], up, axes)
         left = f"along x of {names[0]}" if scans else f"as camera {names[0]} looks"
         shown = f"Frame {names[0]} blue, frame {names[1]} orange; left {left}, right from above."
@@ -90,7 +91,7 @@ def _plots(
 
 
 def _up(diagnosis: Diagnosis, i: int, down: Floats) -> Floats:
-    """Where up is, in frame i's axes, where `down` (3,) is down in each: the mean of its piece."""
+    """The mean up direction (3,) of the component, in frame i's axes; `down (3,)` is down in the axes of each frame."""
     turns = diagnosis.world_from_cam[:, :3, :3]
     up = -(turns[diagnosis.piece == diagnosis.piece[i]] @ down).mean(axis=0)
     size = float(np.linalg.norm(up))
@@ -117,7 +118,8 @@ def _cut(
     robust: Floats,
     up_in_i: Floats,
     name: object,
-    said: Callable[[float], str],
+    *,
+    has_metres: bool,
 ) -> Picture:
     """Both clouds cut open along the offset between the edge and the robust poses, which is exaggerated if small."""
     blue, points = np.asarray(first.points_in_cam, float), np.asarray(second.points_in_cam, float)
@@ -141,10 +143,11 @@ def _cut(
                 axes.scatter(x, y, s=2, color=np.array(colour) / 255, marker=marker, linewidths=0)
             axes.set_aspect("equal", adjustable="datalim")
             axes.set_title(title, fontsize=9)
-            axes.set_xlabel("m" if said is length else UNKNOWN_UNIT, fontsize=8)
+            axes.set_xlabel("m" if has_metres else UNKNOWN_UNIT, fontsize=8)
             axes.tick_params(labelsize=7)
 
     told = f", here {times} times as large" if times > 1 else ""
+    said = length if has_metres else "{:.3g} units".format
     caption = (
         f"A slice through both clouds, {said(CUT_SHARE * extent)} thick, along the offset: frame {name} (orange) "
         f"lies {said(size)} apart{told}."
@@ -169,7 +172,7 @@ def _images(first: Frame, second: Frame) -> Iterator[Picture]:
         caption = "Depth where there is no colour: the brighter, the farther."
         yield Picture(title, caption, raster.jpeg(raster.beside(shown)))
         return
-    found = side_by_side(*shown)
+    found = draw_matches(*shown)
     caption = (
         f"{found.matches} SIFT matches; {found.agreeing} of them (green) agree on one relative pose. Places that look "
         "alike match too: see whether the whole views fit."
@@ -178,26 +181,26 @@ def _images(first: Frame, second: Frame) -> Iterator[Picture]:
 
 
 @dataclass(frozen=True)
-class Matched:
-    """The picture (H, W, 3), the number of matches, and how many of them one relative pose explains."""
+class MatchedImages:
+    """The picture (H, W, 3), the number of matches, and how many of them are inliers of one relative pose."""
 
     image: Bytes
     matches: int
     agreeing: int
 
 
-def side_by_side(first: Bytes, second: Bytes) -> Matched:
+def draw_matches(first: Bytes, second: Bytes) -> MatchedImages:
     """Two RGB images with a line for each match: green where one relative pose explains it, else grey."""
-    canvas = beside([first, second])
+    canvas = raster.beside([first, second])
     found = [_features(image) for image in (first, second)]
     pairs = match(found[0][1], found[1][1], RATIO)
     agreeing = _agreeing(found[0][0], found[1][0], pairs)
-    offset = np.array([first.shape[1] + GAP, 0], np.float32)
+    offset = np.array([first.shape[1] + raster.GAP, 0], np.float32)
     for colour, rows in ((ODD_COLOUR, ~agreeing), (AGREEING_COLOUR, agreeing)):
         for a, b in pairs[rows]:
             start, end = np.round([found[0][0][a], found[1][0][b] + offset]).astype(int).tolist()
             cv2.line(canvas, start, end, colour, 1, cv2.LINE_AA)
-    return Matched(canvas, len(pairs), int(agreeing.sum()))
+    return MatchedImages(canvas, len(pairs), int(agreeing.sum()))
 
 
 def _features(image: Bytes) -> tuple[Floats32, Floats32]:

@@ -1,4 +1,4 @@
-"""Energy of what the edges leave over: how much is gradient, curl of triangles, or loops that no triangle fills."""
+"""Energy of the residual motions: exact part (gradient), co-exact part (curl of triangles), harmonic part (loops)."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class EnergyRow:
 def energy_rows(
     graph: ViewGraph, world_from_cam: Floats, piece: Ints, kept: Bools
 ) -> tuple[tuple[EnergyRow, ...], tuple[str, ...]]:
-    """Rows for every edge inside a piece (V,) and for the `kept (E,)` ones; and in a line why there are none, where the
+    """Rows for all edges inside a component `piece (V,)` and for the `kept (E,)` ones; none, and a note, where the
     graph is too large.
 
     ω is taken at the poses (V, 4, 4), with unit weights, the world's origin at the centroid of each piece.

@@ -1,4 +1,4 @@
-"""How known positions fit the result: notes, a table, numbers, and each of them with what it is off by."""
+"""How known positions fit the result: notes, a table, numbers, and a CSV of their residuals."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SCATTER = 1.5
 
 
 def notes(fit: PositionFit) -> Iterator[Note]:
-    """Where the result is, what was rejected and what is not placed."""
+    """Notes on the world of the result, on rejected positions and on components that could not be placed."""
     if fit.used.any():
         yield Note("world", int(fit.used.sum()), fit.origin)
     if fit.rejected.any():
@@ -31,7 +31,7 @@ def notes(fit: PositionFit) -> Iterator[Note]:
 
 
 def summary(fit: PositionFit) -> dict[str, Any]:
-    """The numbers: how many are used and rejected, root mean squares of what those used are off by, their distances."""
+    """The numbers for `report.json`: counts, RMS residuals in metres, share within 3 sigma, factors on the sigmas."""
     east, north, up = _rms(fit).tolist()
     return {
         "positions": len(fit.used), "used": int(fit.used.sum()), "rejected": fit.labels[fit.rejected].tolist(),
@@ -41,7 +41,7 @@ def summary(fit: PositionFit) -> dict[str, Any]:
 
 
 def table(fit: PositionFit) -> Table:
-    """How far the positions used are off the result."""
+    """The residuals of the positions used, as a table."""
     east, north, up = (length(value) for value in _rms(fit).tolist())
     rows = (
         ("used", f"{int(fit.used.sum())} of {len(fit.used)}"),
@@ -60,7 +60,7 @@ def table(fit: PositionFit) -> Table:
 
 
 def as_csv(fit: PositionFit) -> str:
-    """The positions with what they are off by, metres east, north, up, and in sigmas; empty where not placed."""
+    """The positions with residuals in metres east, north, up, and in sigmas; empty where not placed."""
     rows: list[list[object]] = [["position", "e", "n", "u", "off_e", "off_n", "off_u", "sigmas", "status"]]
     status = np.where(fit.used, "used", np.where(fit.rejected, "rejected", "not placed"))
     numbers = np.column_stack([fit.points, fit.residuals, fit.distance]).round(4)

@@ -69,8 +69,8 @@ def has_truth(report: Report) -> bool:
 
 
 def offsets(report: Report) -> dict[str, Floats]:
-    """How far (N, 3) each set of positions lies from the truth, without one the result from those before; nothing
-    where it did not move.
+    """Offsets (N, 3) of each set of positions from the truth or, without one, of the result from those before;
+    empty where the result did not move.
     """
     paths = {path.name: path.positions for path in report.pictures.paths}
     if not paths.keys() >= {report.before, report.after}:
@@ -86,8 +86,8 @@ def offsets(report: Report) -> dict[str, Floats]:
 
 
 def turns_deg(report: Report) -> dict[str, Floats]:
-    """By how many degrees (N,) each set of poses is turned against what `offsets` compares it with, after the mean turn
-    of each component: positions along a line say little of it.
+    """Angle in degrees (N,) of each set of poses against the reference of `offsets`, after the mean rotation of each
+    component, which an alignment of positions along a line leaves open.
     """
     rotations = {path.name: path.rotations for path in report.pictures.paths}
     reference = rotations.get(TRUTH if has_truth(report) else report.before)

@@ -26,13 +26,13 @@ EDGES = 6
 THUMBNAIL_PX = 300
 LARGE = (720, 540)
 FILL_PX = 5
-"""In a picture that shows the points from near."""
+"""Width in pixels of gaps that are closed in an enlarged picture."""
 CLOSER = 2
 """How many times the place that changed most is enlarged."""
 DOWN = np.diag([1.0, -1.0, -1.0])
 """Right, down and look of a view from above, in the axes of a scanner."""
 VIEWED_PERCENT = 3.0
-"""Of a frame's points, which may lie outside its own picture."""
+"""Percentage of a frame's points that may lie outside its own picture at each side."""
 
 
 def changed_most(

@@ -21,15 +21,15 @@ SIDES = {"front": 0.0, "right": 90.0, "back": 180.0, "left": 270.0}
 MAX_POINTS = 1_200_000
 JPEG_QUALITY = 82
 PAPER, GAP = 255, 8
-"""The shade of what no point covers; pixels between pictures side by side."""
+"""Grey level of the background; pixels between pictures side by side."""
 AMBIENT = 0.55
 FILL_PX = 2
 FRAMING_POINTS = 20_000
 STRAY_PERCENT = 0.5
-"""Of the points, beyond each edge of a picture."""
+"""Percentage of the points that may lie outside a picture at each side."""
 MARGIN = 1.06
 NEAR_M = 0.1
-"""Before the eye of a picture in perspective."""
+"""Distance of the near plane from the eye, in perspective."""
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ from hodge_pipeline.types import Floats, Ints, Solution, Source, Trajectory
 from hodge_pipeline.types.text import cell, csv_text, file_stems
 
 KEY_OF_CACHE = r"-[0-9a-f]{12}$"
-"""What a cached folder's name ends with, which tells nobody anything."""
+"""The hash at the end of a cached folder's name, which is left out of titles."""
 
 
 def write_poses(folder: Path, source: Source, world_from_cam: Floats) -> None:

@@ -19,13 +19,13 @@ from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.text import counted
 
 CENTIMETRES_PER_DEGREE = 1.0
-"""How a residual's angle counts beside its translation when edges are ranked: a scene lies about 0.6 m away."""
+"""Weight of a residual's angle in ranking edges: 1° moves a scene that is 0.6 m away by a centimetre."""
 
 MOST_FRAMES = 3
-"""That a note names."""
+"""Frames that a note names, at most."""
 UNHELD = 0.02
-"""Share of the steps that nothing holds in some direction and no other edge tests, above which the path is in doubt:
-none of fr1, red kitchen, ICL-NUIM, fr3's cabinet; 6 % of a walk where steps slid by 20 cm; all before a bare wall.
+"""Share of steps unconstrained in some direction and tested by no other edge, above which the path is in doubt: none of
+fr1, red kitchen, ICL-NUIM, fr3's cabinet; 6 % of a walk where steps slid by 20 cm; all before a bare wall.
 """
 VERDICTS = ("consistent", "suspect", "wrong", "untestable")
 
@@ -108,7 +108,7 @@ def graph_summary(edges: Edges, vertex_ids: NDArray[np.generic], component: Ints
 
 
 def unheld(edges: Edges, vertex_ids: NDArray[np.generic], min_spread: float) -> tuple[Note, ...]:
-    """A note where much of the path hangs on steps that what their frames share lets slide, and that nothing tests."""
+    """A note where many steps of the path may slide and no other edge tests them."""
     graph = edges.select(edges.in_graph)
     steps = np.abs(np.diff(graph.pairs, axis=1)[:, 0]) == 1
     free = unheld_steps(graph, min_spread) & (graph.verdict == UNTESTABLE)
@@ -147,7 +147,7 @@ def worst_edges(edges: Edges, vertex_ids: NDArray[np.generic], count: int = 10) 
 
 
 def weigh_wrong(last: Round, solver: ConsistencySolver, *, step: Step) -> WrongEdges:
-    """Step: what the edges do that are judged wrong and used all the same: the poses solved without them, compared."""
+    """Step: the effect of the edges judged wrong that the solver used, by a solve without them."""
     assert last.solution is not None
     wrong = (last.graph_edges.verdict == "wrong") & (last.solution.weights > 0)
     if not wrong.any():

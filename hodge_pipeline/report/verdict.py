@@ -24,11 +24,11 @@ UNSETTLED_M, UNSETTLED_SHARE = 0.05, 0.01
 """By how much (root mean square), and by which share of the path, the last of several rounds may move the positions.
 Runs that end near the truth move by less than 1 cm, one whose edges slide along a bare floor by 30."""
 OTHER_SCALE, EXPLAINED = 1.1, 0.25
-"""The factor between the true path and the result from which one is not in metres, where it leaves a quarter of the
-error: focal lengths are known to a few per cent, and units differ by 5 or 1000.
+"""The factor between the true path and the result from which one is not in metres, if scaling by it leaves less than a
+quarter of the error: focal lengths are known to a few per cent, and units differ by 5 or 1000.
 """
 NOTHING_MOVED_M = 0.0005
-"""The least movement that is told in a room."""
+"""The least movement that is reported, in a room."""
 TRUTH = "truth"
 MOST_SIZES = 3
 """Pieces whose sizes a headline tells."""
@@ -53,8 +53,8 @@ REASONS = {
     "depth unit": "depth is probably not in metres",
     "focal length": "images contradict the camera's focal length",
 }
-"""How a headline begins where the run says that its result may be wrong, whatever was measured, and why; lost frames
-where they are `MOSTLY_LOST`."""
+"""By kind of note, what a headline begins with (`DOUBTS`; lost frames from `MOSTLY_LOST` on), and the reasons of `in
+doubt, since …` (`REASONS`), whatever the measures say."""
 MOSTLY_LOST = 0.5
 """The share of the frames."""
 GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
@@ -146,7 +146,7 @@ def capital(text: str) -> str:
 
 
 def _pieces(report: Report) -> str:
-    """What is in one piece and what is not, in words; empty where it goes without saying."""
+    """The components in words; empty where all frames are joined and that is expected."""
     graph, sizes = report.graph, report.pieces
     if graph is None or graph.vertices < 2:
         return ""
@@ -233,7 +233,7 @@ def _unsettled(report: Report) -> Iterator[Note]:
 
 
 def _other_scale(report: Report) -> Iterator[Note]:
-    """Where the true path is as the result's but for its size, in the largest piece."""
+    """A note where the true path is a scaled copy of the result's, in the largest component."""
     paths = {path.name: path.positions for path in report.pictures.paths}
     if not report.has_metres or TRUTH not in paths or report.after not in paths:
         return
@@ -269,7 +269,7 @@ def _graph_suspicions(graph: GraphSummary) -> Iterator[Note]:
 
 
 def _wrong(report: Report) -> Iterator[Note]:
-    """The edges called wrong, weighed by what they do."""
+    """A note on the edges judged wrong, by their effect on the poses."""
     wrong = report.wrong_edges
     if wrong is None or not wrong.count:
         return
@@ -285,7 +285,7 @@ def _wrong(report: Report) -> Iterator[Note]:
 
 
 def _above_truth(report: Report) -> Iterator[Note]:
-    """Why clouds can fit better than at the true poses."""
+    """A note where clouds fit better at the result than at the true poses."""
     table = report.scores
     if table is None or TRUTH not in table.names or report.after not in table.names:
         return

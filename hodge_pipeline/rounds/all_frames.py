@@ -38,8 +38,8 @@ def pose_frames(
     workers: Workers,
     step: Step,
 ) -> Floats:
-    """Step: each frame posed anew by what it saw of its key frame; one that fits nothing keeps its pose (N, 4, 4). The
-    path is then smoothed.
+    """Step: the frames between key frames resected by their sightings, or left at their poses (N, 4, 4) with too few
+    inliers; the path is then smoothed.
     """
     twists = velocities(world_from_cam, stamps_of(source), key_frames.sequence, key_frames.found)
     is_key = np.zeros(len(world_from_cam), bool)
@@ -68,9 +68,9 @@ def pose_frames(
 
 
 def _smooth(world_from_cam: Floats, information: Floats, stamps_s: Floats, key_frames: KeyFrames) -> Floats:
-    """Every unbroken run of frames that were found, smoothed; one that was not posed anew errs as is usual.
+    """Every unbroken run of tracked frames, smoothed; a frame that was not resected has the usual information.
 
-    A path whose stamps are no video's stays as it is: a hand turns back between two of them.
+    A path with longer steps than a video's is left as it is: a hand turns back between two frames.
     """
     posed = np.asarray(information.any(axis=(1, 2)))
     rows, out = np.flatnonzero(key_frames.found), world_from_cam.copy()
@@ -86,8 +86,8 @@ def _smooth(world_from_cam: Floats, information: Floats, stamps_s: Floats, key_f
 
 
 def _usual(information: Floats) -> Floats:
-    """The mean (6, 6) of information (N, 6, 6), each in units of its trace, in the usual one: positive definite as each
-    is, which medians of entries need not be.
+    """The mean (6, 6) of information (N, 6, 6) scaled to trace 1, times the median trace: unlike a median of entries it
+    is positive definite, as each of them is.
     """
     trace = np.einsum("nii->n", information)
     return np.asarray(np.median(trace) * (information / trace[:, None, None]).mean(axis=0))

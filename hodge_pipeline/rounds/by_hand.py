@@ -1,4 +1,4 @@
-"""The round that a person's edits add to a run: the last one's edges, some switched off or on, some registered anew."""
+"""The round that a person's edits add to a run: edges of the last one switched off or on, and newly registered ones."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def _placed(work: Work, graph: ViewGraph) -> Placed:
 
 
 def _start(work: Work, graph: ViewGraph, rounds: Sequence[Round]) -> Floats:
-    """The poses of the round, the latest of equals, that the edges are nearest to on average; the robust ones of the
-    edges themselves where they join what no round had joined.
+    """The poses of the round with the least mean residual of the edges, the latest of equals; robust poses by the edges
+    themselves where they join components that no round had joined.
     """
 
     def distance(one: Round) -> float:
@@ -71,7 +71,7 @@ def _start(work: Work, graph: ViewGraph, rounds: Sequence[Round]) -> Floats:
 
 
 def _edited(work: Work, registered: Edges, history: History) -> Edges:
-    """Every pair of a round as its acceptance and then the edits have it."""
+    """The table with the status of every pair by its acceptance, then by the edits."""
     edges = Edges.joined([work.accept(registered), Edges.measured(work.measured)])
     let_in = (edges.status == REJECTED) & _any_joining(edges, work.measured.vertex_ids, history.enabled)
     edges = edges.put(let_in, status=USED, why="")

@@ -1,4 +1,4 @@
-"""Pairs registered beside those of the edge builders: in one piece from the poses, between two without a guess."""
+"""Registration of named pairs: from the poses within a component, by global registration between two."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from hodge_pipeline.types.notes import Note
 
 @dataclass(frozen=True)
 class Placed:
-    """Poses (N, 4, 4) of all frames, each in its piece (N,)."""
+    """Poses (N, 4, 4) of all frames, each in its component `piece (N,)`."""
 
     world_from_cam: Floats
     piece: Ints

@@ -32,15 +32,15 @@ from hodge_pipeline.types.edges import HELD_OUT
 from hodge_pipeline.types.notes import Note, notes_of
 
 LEFT_OUT = 1e-3
-"""A weight below which a robust solver has left an edge out, whether or not it keeps a rest."""
+"""Weight below which a robust solver counts as having left an edge out: some keep a small rest."""
 EDITED = "edited"
 """The name of a round that a person's edits made."""
 
 
 @dataclass(frozen=True)
 class Registered:
-    """What a round is solved from: its pairs, measured ones last, of which it registered the rows `fresh (F,)` from the
-    poses `before (N, 4, 4)`; and the poses `start (N, 4, 4)` of the solve, which may not leave out the rows `right`.
+    """The input of a round's solve: `edges`, measured ones last, `fresh (F,)` the rows that the round registered from
+    the poses `before (N, 4, 4)`; the solve begins at `start (N, 4, 4)` and may not leave out the rows `right`.
     """
 
     name: str
@@ -55,7 +55,7 @@ class Registered:
         return self.edges.as_graph(vertex_ids, self.edges.counts)
 
     def solved(self, solve_with: SolveWith) -> Bools:
-        """The rows to solve with: all that count, or of these what the diagnosis keeps or a person calls right."""
+        """Where (P,) a row is solved with: all that count, or those not judged wrong or suspect, or right by hand."""
         if solve_with == "all":
             return self.edges.counts
         kept = ~np.isin(self.edges.verdict, (WRONG, SUSPECT))
@@ -81,8 +81,8 @@ class Work:
     fixes: Fixes | None = None
 
     def placed_first(self) -> Round:
-        """The first round, its loops closed along the path, its poses in the world of known positions where there are
-        any: pairs that close loops are then near.
+        """The first round with loops closed along the path, in the world of known positions if there are any, so that
+        pairs that close loops are near.
         """
         scene = self.scene
         closed = scene.closed
@@ -120,9 +120,7 @@ class Work:
         return Registered(f"round {number}", edges, fresh, world_from_cam, world_from_cam)
 
     def accept(self, edges: Edges) -> Edges:
-        """The table with the status of every registered pair; one that odometry measured, and that was registered to
-        somewhere else, keeps odometry's measurement.
-        """
+        """The table with the status of every registered pair, steps of odometry as in `with_odometry`."""
         found, slid = accepted(edges, self.recipe.acceptance, self.scene.drift, self.scene.in_order)
         if len(slid):
             self.steps.note(Note("slid", len(slid), in_runs(slid, self.scene.first.vertex_ids)))
@@ -130,7 +128,7 @@ class Work:
 
     @property
     def scale(self) -> float:
-        """What lengths that are written for rooms are multiplied by."""
+        """Factor on lengths that are written for rooms."""
         return self.recipe.scale if isinstance(self.recipe.scale, float) else 1.0
 
     def with_measured(self, edges: Edges) -> Edges:
@@ -138,7 +136,7 @@ class Work:
         return Edges.joined([edges, Edges.measured(self.measured)])
 
     def judge(self, registered: Registered) -> Registered:
-        """The same with the verdict of the diagnosis on each edge, before any solve."""
+        """The input of the solve with the verdict of the diagnosis on each edge."""
         title = f"diagnosis, {registered.name}"
         ids = self.scene.first.vertex_ids
         edges = self.steps.step(judge_edges, registered.edges, ids, self.recipe.diagnosis, title=title)
@@ -178,9 +176,9 @@ def propose_edges(
 
 
 def with_start_edges(candidates: Edges, first: Round) -> Edges:
-    """The candidates, and those edges of the start that join what the candidates leave apart.
+    """The candidates, and those edges of the start that join different components of the candidates.
 
-    Consecutive frames join nothing here: across a gap they have nothing in common.
+    Candidates of consecutive frames do not connect: across a gap these may share nothing.
     """
     if first.name != START:
         return candidates
@@ -212,8 +210,9 @@ def solve_edges(
     *,
     step: Step,
 ) -> Round:
-    """Step: the round of these edges and the poses consistent with them, and with known positions where there are any,
-    `up (3,)` being what points up; `found` of ω at its start is kept.
+    """Step: the round of these edges, with poses consistent with them and with `fixes`.
+
+    `up (3,)` points up in the world of the start; `found` are the energies of ω before the solve.
     """
     edges, solved = registered.edges, registered.solved(solve_with)
     graph = edges.as_graph(vertex_ids, solved)
@@ -238,7 +237,7 @@ def solve_edges(
 
 
 def with_right(graph: ViewGraph, solution: Solution, right: Bools) -> Solution:
-    """The solution with those of the edges that are right (E,) which a robust solver left out."""
+    """The solution with the `right (E,)` edges put back that a robust solver left out."""
     left_out = np.flatnonzero(right & (solution.weights < LEFT_OUT))
     if not len(left_out):
         return solution

@@ -17,7 +17,7 @@ from hodge_pipeline.types.text import counted
 NEAREST = 6
 """Nearest views of each view that are candidates, whatever edges there are."""
 TESTED_GAIN = 1.0
-"""Nats for each untestable edge that becomes testable, added to the logarithm of the variance saved."""
+"""Nats added to the score for each untestable edge that becomes testable."""
 DIGITS = 9
 """Of nats: pairs of equal worth come in order on every machine, not as it rounds."""
 EACH_VERTEX = 2
@@ -106,8 +106,8 @@ def _contains(edges: Ints, pairs: Ints, count: int) -> Bools:
 
 
 def _best_first(pairs: Ints, kept: Ints, untestable: Ints, network: Network, most: int) -> Suggestions:
-    """The pair that adds most to the kept edges, then the one that adds most to both, and so on; none whose views were
-    named too often.
+    """Greedy choice: the pair that adds most to the kept edges, then the one that adds most to these and the first, and
+    so on; no view in more than `EACH_VERTEX` pairs.
     """
     resistance, taken, count = network.between(pairs), list[Floats](), len(network.component)
     pair, edge = _triangles(pairs, untestable, kept, count)
@@ -167,7 +167,7 @@ def _reasons(resistance: Floats, tests: Ints) -> tuple[str, ...]:
             text = "joins two pieces"
         else:
             after = np.sqrt(value / (1 + value))
-            text = f"the deviation between the two falls from {np.sqrt(value):.2g} to {after:.2g} of one edge's"
+            text = f"sigma of their relative pose falls from {np.sqrt(value):.2g} to {after:.2g} times one edge's"
         if number:
             text = f"tests {counted(number, 'untestable edge')}; {text}"
         lines.append(text)

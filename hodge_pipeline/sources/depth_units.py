@@ -15,27 +15,28 @@ from hodge_pipeline.types.notes import Note
 
 SAMPLED_FRAMES = 8
 PLAUSIBLE_DEPTH_M = (0.25, 30.0)
-"""The median depth of a scene; outside, the scale is probably wrong. Few depth cameras see anything nearer (L515 .25 m,
-D435 .28, Kinect .4)."""
+"""Range of the median depth of a scene: outside, the scale is probably wrong. Few depth cameras see nearer (L515
+0.25 m, D435 0.28, Kinect 0.4)."""
 NEAR_M, FAR_M = 1.3, 10.0
-"""Where the depth of a room, in millimetres but read as TUM's 5000 to the metre, ends: 6.5 m. As far as depth cameras
-for rooms are specified to see: RealSense D435; Kinect and Xtion 4 to 8."""
+"""Metres. Doubted is 99 % of depth below the first, where a room of 6.5 m ends in millimetres read at TUM's 5000 per
+metre, and a quarter beyond the second: depth cameras for rooms reach 10 m (RealSense D435; Kinect and Xtion 4 to 8)."""
 PRIMESENSE_STEP = 2.89e-3
-"""Of 1/z, in 1/m: an eighth of a pixel over 580 px times 7.5 cm. Seven Kinect sequences show 2.88 to 2.92e-3, two
+"""Step of 1/z, in 1/m: an eighth of a pixel over 580 px times 7.5 cm. Seven Kinect sequences show 2.88 to 2.92e-3, two
 recordings of a RealSense 1.63 and 1.01e-3."""
 WRONG_UNITS, SAME, ALIKE = (0.2, 5.0, 8.0, 10.0), 0.03, 1.45
-"""Depth too large by so much: millimetres read as TUM's, the reverse, OpenNI's shifted by three bits, tenths of a
-millimetre; sensors of one kind differ less than `SAME`. A step `ALIKE` times PrimeSense's may be another sensor's."""
+"""Factors on depth of known wrong units: millimetres read as TUM's, the reverse, OpenNI's shifted by three bits, tenths
+of a millimetre. Steps of one kind of sensor differ by less than `SAME`; a step off by more than a factor `ALIKE` is
+that of another sensor."""
 SEEN_M = 4.0
-"""A median depth above it is more than a Kinect sees well: finer steps are then more likely those of a wrong unit."""
+"""Metres: a Kinect hardly sees a larger median depth, so that finer steps then rather mean a wrong unit."""
 FEWEST_PIXELS, FEWEST_VALUES, ROUNDINGS = 5, 20, 5
-"""Pixels of a value that count; steps to judge by, each so many roundings of the stored number long."""
+"""Pixels that a value needs to count; steps needed; their least length in units of the stored number."""
 WHOLE, MOSTLY = 0.15, 0.9
-"""So far from a whole multiple of the base step may a step lie, and so many must not lie farther."""
+"""Distance of a step from a whole multiple of the base step, at most, and the share of steps that must keep it."""
 
 
 def depth_doubts(frames: Sequence[Frame]) -> tuple[Note, ...]:
-    """What speaks against depth being in metres, by a few depth images, evenly over the sequence.
+    """Notes on depth that seems not to be in metres, by a few depth images, evenly over the sequence.
 
     An image that cannot be read is left to whoever reads it next.
     """
@@ -50,7 +51,7 @@ def depth_doubts(frames: Sequence[Frame]) -> tuple[Note, ...]:
 
 
 def doubts_of(depth_m: NDArray[np.floating[Any]]) -> tuple[Note, ...]:
-    """The same by depths of many pixels, 0 where there is none."""
+    """Notes on depths of many pixels, 0 where there is none, that seem not to be in metres."""
     valid = depth_m[depth_m > 0]
     if not len(valid):
         return ()

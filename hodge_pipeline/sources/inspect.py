@@ -59,7 +59,7 @@ def guess_reader(path: Path, known: Sequence[Guess] | None = None) -> FrameReade
 
 
 def _opened(reader: FrameReader, path: Path) -> tuple[Source, CameraError | None]:
-    """The source; where nothing tells the intrinsics of its images, with any camera, and the error."""
+    """The source and None; without known intrinsics, the source with a made-up camera and the `CameraError`."""
     try:
         return reader.open(path), None
     except CameraError as error:
@@ -71,10 +71,8 @@ def _opened(reader: FrameReader, path: Path) -> tuple[Source, CameraError | None
 def inspect(path: Path, reader: FrameReader | None = None) -> dict[str, Any]:
     """Facts of a path as plain data: guesses, frames, stamps, cameras, depth, poses, graph, notes, oddities.
 
-    The surest reader opens it where none is given.
-
-    Images are not read but for the depth of a few frames. What has no value (a range of nothing) is left out. Options
-    that the reader cannot do without are `missing`.
+    The surest reader opens it where none is given; only the depth of a few frames is read. Facts without a value are
+    left out. `missing` lists options that the reader needs.
     """
     known = guesses(path) if path.is_file() or path.is_dir() else []
     source, camera_error = _opened(reader or guess_reader(path, known), path)

@@ -1,4 +1,4 @@
-"""Edges that come measured: a source's own graph, or files of them. They take part in a run without registration."""
+"""Measured edges: a source's own graph, or files of them. They take part in a run without registration."""
 
 from __future__ import annotations
 
@@ -104,9 +104,8 @@ def _between_frames(
     known = 0 if graph.priors is None else len(graph.priors.vertices)
     if known or len(graph.fixed):
         notes.append(
-            f"{name}: its {len(graph.fixed)} fixed vertices and {counted(known, 'prior has|priors have')} no "
-            "part in a run: "
-            "hodge solve heeds them"
+            f"{name}: its {len(graph.fixed)} fixed vertices and {counted(known, 'prior has|priors have')} no part in a "
+            "run: hodge solve heeds them"
         )
     over_frames = replace(graph.select(good), edges=rows[good], vertex_ids=_no_edges(frames).vertex_ids)
     return replace(over_frames, dimension=3, fixed=np.zeros(0, np.int64))

@@ -18,18 +18,18 @@ from hodge_pipeline.types import Source
 from hodge_pipeline.types.notes import Note
 
 SURE = 0.6
-"""Confidence of a reader from which a path is said to look like its format."""
+"""Confidence from which another reader is suggested."""
 NAMED = 5
 MARGIN = 0.2
-"""How much surer it must be than the reader of the recipe."""
+"""By how much its confidence must exceed that of the recipe's reader."""
 
 Fingerprints = dict[Path, tuple[Any, ...]]
 
 
 def remembered(source: Source, reader: FrameReader | None, steps: Steps, prints: Fingerprints) -> Source:
-    """The source, for which name and fingerprint of each of its files, and the reader's options, stand in keys.
+    """The source, keyed in the store by the fingerprints of its files and by the reader with its options.
 
-    A source that no reader opened is in memory and cannot be told from its like: no other run has its key.
+    A source made in memory, without a reader, gets a random key: no other run reuses its steps.
     """
     files = [(str(path.absolute()), *found) for path, found in prints.items()]
     steps.remember(source, uuid.uuid4().hex if reader is None else steps.key([files, reader]))
@@ -42,7 +42,7 @@ def fingerprints(files: Sequence[Path], *, strict: bool = False) -> Fingerprints
 
 
 def changed_since(before: Fingerprints, *, strict: bool = False) -> tuple[Note, ...]:
-    """A note where files are not as their `fingerprints` were: what came of both belongs to neither."""
+    """A note where files no longer have these fingerprints, so that results may mix two versions of them."""
     now = fingerprints(list(before), strict=strict)
     changed = [path.name for path in before if now[path] != before[path]]
     return (Note("input changed", len(changed), ", ".join(changed[:NAMED])),) if changed else ()
@@ -105,7 +105,7 @@ def _described(guess: Guess) -> str:
 
 
 def _remedy(reader: str, path: Path, recipes: Collection[str]) -> str:
-    """The recipe that is named as the reader, else the option that takes it; the command for what has no frames."""
+    """What to try: the recipe named as the reader, else the option that takes it; another command without frames."""
     if reader in recipes:
         return f"try the recipe {reader}"
     try:

@@ -13,7 +13,7 @@ from hodge_pipeline.types import Source
 from hodge_pipeline.types.input_files import open_input
 
 LOOKED_AT = 60
-"""Paths inside a folder that the readers are asked about: some hundredths of a second."""
+"""Paths inside a folder that the readers sniff at, at most: some hundredths of a second."""
 IMAGES, AS_PNG = "images are read as PNG or JPEG", "to PNG, depth with all 16 bits"
 DEPTH = 3
 NAMED = 3
@@ -32,14 +32,14 @@ def unknown(path: Path) -> SourceError:
         named = ", ".join(f"{found} ({name})" for found, name in inside[:NAMED])
         more = "" if len(inside) <= NAMED else " and others"
         return SourceError(f"{path}: is no source itself, but holds some: give {named}{more}")
-    if nothing := _nothing(path):
-        return SourceError(f"{path}: {nothing}")
+    if problem := _problem(path):
+        return SourceError(f"{path}: {problem}")
     remedy = "name one with --reader, in a run with --set source.reader="
     return SourceError(f"{path}: no reader knows this format (readers: {', '.join(readers)}): {remedy}")
 
 
-def _nothing(path: Path) -> str:
-    """What to do about a path without contents, or packed ones; nothing of one that has some."""
+def _problem(path: Path) -> str:
+    """What is wrong with a path that is empty, packed or unreadable, or has images of another format; else empty."""
     if path.is_file() and not path.stat().st_size:
         return "the file is empty: record or copy it again"
     if path.is_file() and path.suffix.lower() in PACKED:

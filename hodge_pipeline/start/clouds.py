@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-from hodge_pipeline.registration.clouds import CloudOptions, frame_blocks, landmarks_of, prepare_clouds
+from hodge_pipeline.registration.clouds import CloudOptions, in_blocks, landmarks_of, prepare_clouds
 from hodge_pipeline.stages import Step, Steps, Workers, in_order
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.store import artifacts
@@ -40,15 +40,15 @@ def with_landmarks(
 
 
 def add_landmarks(source: Source, made: CloudSet, options: CloudOptions, *, workers: Workers, step: Step) -> CloudSet:
-    """Step: the clouds with landmarks of the frames (N) that they are of; their points are the files of before."""
+    """Step: the clouds (N) with landmarks of their frames (N); the files of their points are linked, not copied."""
 
-    def told(block: CloudSet) -> CloudSet:
+    def counted_in(block: CloudSet) -> CloudSet:
         step.advance(len(block))
         return block
 
     assert made.folder is not None
-    folder, found = step.folder / CLOUDS, workers.map(partial(landmarks_of, options), frame_blocks(source.frames))
-    CloudSet.write(folder, map(told, in_order(found)))
+    folder, found = step.folder / CLOUDS, workers.map(partial(landmarks_of, options), in_blocks(source.frames))
+    CloudSet.write(folder, map(counted_in, in_order(found)))
     for name in CloudSet.OF_POINTS:
         artifacts.link_or_copy(made.folder / f"{name}.npy", folder / f"{name}.npy")
     return CloudSet.open(folder)

@@ -43,9 +43,9 @@ from hodge_pipeline.types.notes import Note, notes_of
 from hodge_pipeline.types.text import counted
 
 JUMP_SHARE = 0.25
-"""Of what makes a key frame: smaller jumps move the frames between two key frames by little."""
+"""Share of the motion between key frames above which an odd step is a jump: smaller ones matter little."""
 SAME_M = 1e-6
-"""Metres: given poses that are this near the true ones are the true ones."""
+"""Metres and rotation entries within which given poses count as the true ones."""
 
 
 @dataclass(frozen=True, config=OPTIONS)
@@ -93,34 +93,22 @@ class GivenStart:
         poses = matched.world_from_cam
         if not known.all():
             poses = self._bridged(source, matched, clouds, steps, workers)
-        rows = choose_key_frames(
-            poses, list(sequences_of(source).values()), self.distance_m, self.angle_deg, self.every
-        )
-        rows = np.union1d(rows, self._at_jumps(poses, list(sequences_of(source).values())))
+        sequences = list(sequences_of(source).values())
+        rows = choose_key_frames(poses, sequences, self.distance_m, self.angle_deg, self.every)
+        rows = np.union1d(rows, self._at_jumps(poses, sequences))
         steps.note(Note("key frames", len(rows), str(len(source.frames))))
-        whole = deskewed_along(given_away(source, poses, rows), poses, clouds, steps)
-        count = len(poses)
-        key_frames = KeyFrames(
-            rows=rows,
-            first=poses,
-            world_from_key=poses[rows],
-            part=np.zeros(count, np.int64),
-            times=matched.frame_times,
-            found=np.ones(count, bool),
-            stamps_s=matched.frame_times,
-            sequence=sequence_numbers(source),
-            key_of_frame=np.clip(np.searchsorted(rows, np.arange(count), side="right") - 1, 0, None),
-        )
+        whole = deskewed_along(without_given_poses(source, poses, rows), poses, clouds, steps)
         keys = replace(key_source(whole, rows), graph=None)
         steps.remember(keys, steps.key([source, rows, poses]) + "deskewed")
         steps.remember(whole, steps.key([source, poses]) + "deskewed")
         made = make_clouds(keys, clouds, steps, workers)
         first = Round(Edges.of([]), vertex_ids(keys), poses[rows], name=START)
+        key_frames = _key_frames(source, rows, poses, matched.frame_times)
         return Scene(whole, keys, key_frames, made, first, is_given=True, given=file)
 
     def _at_jumps(self, poses: Floats, sequences: Sequence[Ints]) -> Ints:
-        """The rows at both ends of a step that is unlike the one before and the one after it: what mends a jump is not
-        to be spread over the frames around it.
+        """The rows at both ends of a step that differs from the steps before and after it, so that the correction of a
+        jump is not spread over the frames around it.
         """
         found = [np.zeros(0, np.int64)]
         for rows in sequences:
@@ -149,10 +137,9 @@ class GivenStart:
     def _bridged(
         self, source: Source, matched: Matched, clouds: CloudOptions, steps: Steps, workers: Workers
     ) -> Floats:
-        """A pose for every frame: between the given ones the odometry's, bent so that it meets them. Odometry runs over
-        the gaps alone.
+        """A pose for every frame: odometry over the gaps, its error against the given poses spread along each gap.
 
-        Where frames of a sequence have no given pose at all, they begin at the nearest given pose.
+        A sequence without any given pose begins at the nearest given pose of another.
         """
         given = matched.world_from_cam
         known: Bools = se3.has_pose(given)
@@ -173,9 +160,25 @@ class GivenStart:
         return np.asarray(poses)
 
 
+def _key_frames(source: Source, rows: Ints, poses: Floats, times: Floats) -> KeyFrames:
+    """`KeyFrames` by `rows (K,)`, poses (N, 4, 4) and times (N,); every frame follows the last key frame before it."""
+    count = len(poses)
+    return KeyFrames(
+        rows=rows,
+        first=poses,
+        world_from_key=poses[rows],
+        part=np.zeros(count, np.int64),
+        times=times,
+        found=np.ones(count, bool),
+        stamps_s=times,
+        sequence=sequence_numbers(source),
+        key_of_frame=np.clip(np.searchsorted(rows, np.arange(count), side="right") - 1, 0, None),
+    )
+
+
 def gaps_between(known: Bools, sequences: Sequence[Ints]) -> list[Ints]:
-    """Runs of rows of the sequences that hold every frame without a pose, with one known frame after it and two before,
-    so that odometry knows how fast it was.
+    """Runs of rows that hold every frame without a pose, with one posed frame after it and two before, from which
+    odometry takes its first velocity.
     """
     runs = []
     for rows in sequences:
@@ -201,7 +204,7 @@ def _carried(odometry: Floats, gap: Ints, given: Floats, known: Bools) -> Floats
     return np.asarray(given[nearest] @ se3.inverse(odometry[0]) @ odometry)
 
 
-def given_away(source: Source, poses: Floats, rows: np.ndarray) -> Source:
+def without_given_poses(source: Source, poses: Floats, rows: np.ndarray) -> Source:
     """The source without its frames' own poses, since the run starts from given ones, and without true poses where
     those are the given ones: there is nothing to compare with then.
     """
@@ -216,7 +219,7 @@ def given_away(source: Source, poses: Floats, rows: np.ndarray) -> Source:
 
 
 def _true_at(times: Floats, matched: Matched, source: Source) -> Floats:
-    """The truth (P, 4, 4) nearest to each given pose, on the clock that these were matched by."""
+    """The true pose (P, 4, 4) nearest in time to each given one, NaN where there is none near."""
     true = true_poses(source)
     known = se3.has_pose(true)
     true_times, true = matched.frame_times[known], true[known]
@@ -229,7 +232,7 @@ def _true_at(times: Floats, matched: Matched, source: Source) -> Floats:
 
 
 def read_trajectory(path: Path, steps: Steps) -> Trajectory:
-    """The poses in a file of any format that a reader opens; its reader's notes are told. Raises `SourceError`."""
+    """The poses in a file of any format that a reader opens; the reader's notes are passed on. Raises `SourceError`."""
     opened = guess_reader(path).open(path)
     if opened.graph is not None and opened.graph.edge_count:
         raise SourceError(f"{path}: a graph of measured edges, which needs no frames: give it to hodge solve")

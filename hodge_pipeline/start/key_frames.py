@@ -6,7 +6,7 @@ from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -42,7 +42,7 @@ from hodge_pipeline.types.text import counted
 
 NOTES_SHOWN = 5
 WHOLE_STILLS = 300
-"""Frames that are registered whole where they are no video: tracking by optical flow glues stills."""
+"""Frames up to which `auto` registers every frame of what is no video, whose steps optical flow may not bridge."""
 DOUBTED = 0.1
 """Share of the frames whose motion may be an object's, from which the whole path is in doubt: of fr1/rpy's every third
 frame, where nothing moves but much is blurred, 0.07 are.
@@ -51,12 +51,11 @@ frame, where nothing moves but much is blurred, 0.07 are.
 
 @plain_dataclass(frozen=True)
 class Tracked:
-    """What tracking found: the K key frames among the N frames, and the key frame that each frame was registered to.
+    """The K key frames among the N frames, and the motion of every frame from its key frame.
 
-    `anchors (N,)` counts among the K, `key_from_frame (N, 4, 4)` is the motion, `found (N,)` whether there is one;
-    `world_from_key (K, 4, 4)` are the poses that `steps` led to, `piece (K,)` the part that they hold together;
-    `sightings` is the folder of what the frames of each block saw of their key frames; `apart` and `readout_s` as of
-    `KeyFrames`.
+    `anchors (N,)` is the key frame of each frame, counted among the K, `key_from_frame (N, 4, 4)` the motion,
+    `found (N,)` whether it was tracked; `world_from_key (K, 4, 4)` are the poses by `steps`, `piece (K,)` their
+    connected components; `sightings` is a folder of `Sightings`; `apart` and `readout_s`: see `KeyFrames`.
     """
 
     clouds: CloudSet
@@ -126,9 +125,7 @@ class KeyFrameStart(OdometryStart):
 
 
 def is_video(source: Source) -> bool:
-    """Whether it has depth images most of which, by a clock or by numbers that count so many a second, follow each
-    other at the rate of a video.
-    """
+    """Whether it has depth images, in the median at most `VIDEO_STEP_S` apart by a clock or numbers of known rate."""
     a_second = 1.0 if has_real_stamps(source.frames) else source.numbered_hz
     if len(source.frames) < 2 or not a_second or not any(frame.read_depth for frame in source.frames):
         return False
@@ -136,13 +133,13 @@ def is_video(source: Source) -> bool:
 
 
 def _is_without_rate(source: Source) -> bool:
-    """Whether it has depth images, and stamps that are numbers of which nothing tells how many make a second."""
+    """Whether it has depth images whose stamps are frame numbers of unknown rate."""
     are_numbers = len(source.frames) > 1 and not has_real_stamps(source.frames)
     return are_numbers and not source.numbered_hz and any(frame.read_depth for frame in source.frames)
 
 
 def followers(source: Source, tracked: Tracked) -> KeyFrames:
-    """The `KeyFrames` of a tracked source: how poses of all frames follow from those of the key frames."""
+    """The `KeyFrames` of a tracked source."""
     return KeyFrames(
         rows=tracked.key_rows,
         first=tracked.world_from_key[tracked.anchors] @ tracked.key_from_frame,
@@ -182,33 +179,45 @@ def track(source: Source, options: TrackingOptions, *, workers: Workers, step: S
     sightings = folder / "sightings"
     sightings.mkdir(exist_ok=True)
     blocks.keep_sightings(sightings)
+    anchors, key_from_frame, found = _anchored(parts, cut, key_of_row, repeats)
     tracked = Tracked(
         clouds=clouds,
         sightings=sightings,
         key_rows=key_rows,
+        anchors=anchors,
+        key_from_frame=key_from_frame,
+        found=found,
         world_from_key=poses,
         piece=connected_components(held.pairs, len(key_rows)),
         steps=held,
         apart=np.unique(np.concatenate([part.apart for part in parts])),
-        **_anchored(parts, cut, key_of_row, repeats),
     )
     tracked = _without_lonely(tracked)
     first = tracked.world_from_key[tracked.anchors] @ tracked.key_from_frame
-    twists = velocities(first, stamps_of(source), sequence_numbers(source), tracked.found)
-    notes = _notes(source, tracked, parts, repeats)
-    readout = estimate_readout(sightings, source.frames, first, twists, options.clouds.unit_m)
-    if readout is not None:
-        tracked = replace(tracked, readout_s=readout.best_s)
-        best, low, high = (f"{1e3 * time_s:.0f}" for time_s in (readout.best_s, readout.low_s, readout.high_s))
-        notes = (*notes, Note("readout", detail=f"{best} ms ({low} to {high})"))
-    focal = estimate_focal(sightings, source.frames, first, twists, tracked.readout_s, options.clouds.unit_m)
-    if focal is not None and focal.is_other:
-        told = f"{focal.best:.0f} pixels ({focal.low:.0f} to {focal.high:.0f}) better than its {focal.own:.0f}"
-        notes = (*notes, Note("focal length", detail=told))
+    twists = velocities(first, stamps, sequence_numbers(source), tracked.found)
+    readout_s, camera_notes = _camera_estimates(source, sightings, first, twists, options.clouds.unit_m)
+    tracked = replace(tracked, readout_s=readout_s)
     _move_landmarks(source, tracked, twists)
     blocks.remove()
-    step.note(*notes)
+    step.note(*_notes(source, tracked, parts, repeats), *camera_notes)
     return tracked
+
+
+def _camera_estimates(
+    source: Source, sightings: Path, world_from_cam: Floats, twists: Floats, unit_m: float
+) -> tuple[float, tuple[Note, ...]]:
+    """The read-out time in seconds, 0 without an estimate, and notes on it and on a focal length that does not fit."""
+    notes, readout_s = list[Note](), 0.0
+    readout = estimate_readout(sightings, source.frames, world_from_cam, twists, unit_m)
+    if readout is not None:
+        readout_s = readout.best_s
+        best, low, high = (f"{1e3 * time_s:.0f}" for time_s in (readout.best_s, readout.low_s, readout.high_s))
+        notes.append(Note("readout", detail=f"{best} ms ({low} to {high})"))
+    focal = estimate_focal(sightings, source.frames, world_from_cam, twists, readout_s, unit_m)
+    if focal is not None and focal.is_other:
+        detail = f"{focal.best:.0f} pixels ({focal.low:.0f} to {focal.high:.0f}) better than its {focal.own:.0f}"
+        notes.append(Note("focal length", detail=detail))
+    return readout_s, tuple(notes)
 
 
 def _track_missing(
@@ -229,9 +238,9 @@ def _renumbered(rows: Ints, key_of_row: dict[int, int]) -> Ints:
 
 def _anchored(
     parts: list[BlockRows], cut: list[FrameBlock], key_of_row: dict[int, int], repeats: Ints
-) -> dict[str, Any]:
-    """Key frame, relative motion and success of each frame; a row that two blocks share belongs to the earlier one, and
-    frames that repeat another, which were not tracked, follow its key frame.
+) -> tuple[Ints, Floats, Bools]:
+    """`anchors`, `key_from_frame` and `found` of `Tracked`; a row that two blocks share belongs to the earlier one, and
+    frames that repeat the images of another, which were not tracked, take its motion.
     """
     fresh = [slice(int(block.warm_up), None) for block in cut]
     rows = np.concatenate([part.rows[keep] for part, keep in zip(parts, fresh, strict=True)])
@@ -241,11 +250,8 @@ def _anchored(
     order = np.argsort(rows)
     every = np.arange(len(rows) + len(repeats))
     order = order[np.searchsorted(rows[order], every, side="right") - 1]
-    return {
-        "anchors": _renumbered(anchors[order], key_of_row),
-        "key_from_frame": motions[order],
-        "found": np.isfinite(fitness[order]) & ~np.isin(every, repeats),
-    }
+    found = np.isfinite(fitness[order]) & ~np.isin(every, repeats)
+    return _renumbered(anchors[order], key_of_row), motions[order], np.asarray(found)
 
 
 def _without_lonely(tracked: Tracked) -> Tracked:
@@ -269,38 +275,34 @@ def _move_landmarks(source: Source, tracked: Tracked, twists: Floats) -> None:
 
 
 def _notes(source: Source, tracked: Tracked, parts: list[BlockRows], repeats: Ints) -> tuple[Note, ...]:
+    ids, sequences = vertex_ids(source), list(sequences_of(source).values())
+
+    def listed(kind: str, rows: Ints) -> list[Note]:
+        return [Note(kind, len(rows), in_runs(rows, ids))] if len(rows) else []
+
+    def rows_of(column: str) -> Ints:
+        return np.unique(np.concatenate([getattr(part, column) for part in parts]))
+
     notes = [Note("key frames", len(tracked.key_rows), str(len(tracked.anchors)))]
-    lost = np.setdiff1d(np.flatnonzero(~tracked.found), repeats)
-    ids = vertex_ids(source)
-    back = [row for rows in sequences_of(source).values() for row in _where_the_clock_goes_back(source, rows)]
-    if back:
-        notes.append(Note("clock", len(back), in_runs(np.array(back), ids)))
-    notes += told_gaps(list(sequences_of(source).values()), stamps_of(source), ids)
-    if len(repeats):
-        notes.append(Note("repeated images", len(repeats), in_runs(repeats, ids)))
-    if len(lost):
-        notes.append(Note("tracking lost", len(lost), in_runs(lost, ids)))
+    back = [row for rows in sequences for row in _where_the_clock_goes_back(source, rows)]
+    notes += listed("clock", np.array(back, np.int64))
+    notes += told_gaps(sequences, stamps_of(source), ids)
+    notes += listed("repeated images", repeats)
+    notes += listed("tracking lost", np.setdiff1d(np.flatnonzero(~tracked.found), repeats))
     unread = {int(row): why for part in parts for row, why in zip(part.unread, part.unread_why, strict=True)}
     if unread:
         rows = np.array(sorted(unread))
         first = unread[rows[0]].replace(f"{source.path}/", "")
         notes.append(Note("images unread", len(rows), f"({in_runs(rows, ids)}), such as {first}"))
-    blank = np.unique(np.concatenate([part.blank for part in parts]))
-    if len(blank):
-        notes.append(Note("blank images", len(blank), in_runs(blank, ids)))
-    moving = np.unique(np.concatenate([part.moving for part in parts]))
-    if len(moving):
-        notes.append(Note("moving objects", len(moving), in_runs(moving, ids)))
-    doubtful = np.unique(np.concatenate([part.doubtful for part in parts]))
+    notes += listed("blank images", rows_of("blank"))
+    notes += listed("moving objects", rows_of("moving"))
+    doubtful = rows_of("doubtful")
     if len(doubtful) > DOUBTED * len(tracked.anchors):
-        notes.append(
-            Note(
-                "camera or object", len(doubtful), f"{counted(len(tracked.anchors), 'frame')}, {in_runs(doubtful, ids)}"
-            )
-        )
+        detail = f"{counted(len(tracked.anchors), 'frame')}, {in_runs(doubtful, ids)}"
+        notes.append(Note("camera or object", len(doubtful), detail))
     sizes = np.bincount(tracked.piece)
     pieces = int((sizes > 1).sum())
-    if pieces > len(sequences_of(source)):
+    if pieces > len(sequences):
         notes.append(Note("path broken", pieces - 1, str(pieces)))
     return (*notes, *notes_of("clouds", _few(list(dict.fromkeys(note for part in parts for note in part.notes)))))
 

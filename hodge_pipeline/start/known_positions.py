@@ -43,7 +43,7 @@ class PositionOptions:
 
 
 def known_positions(source: Source, options: PositionOptions, steps: Steps) -> Positions | None:
-    """The positions that the options name, None where they name none. Raises `SourceError` where there are none."""
+    """The positions that the options ask for, None for none. Raises `SourceError` where source or file hold none."""
     if options.path is None:
         return None
     if str(options.path) == OWN:
@@ -58,7 +58,7 @@ def known_positions(source: Source, options: PositionOptions, steps: Steps) -> P
 
 
 def known_fixes(scene: Scene, options: PositionOptions, steps: Steps) -> Fixes | None:
-    """The known positions of a scene's frames as points of its key frames, None where the options name none."""
+    """The known positions as points of the scene's key frames; None, and `SourceError`, as of `known_positions`."""
     found = known_positions(scene.whole, options, steps)
     return None if found is None else fixes_of(found, options, scene, steps)
 
@@ -97,7 +97,7 @@ def fixes_of(positions: Positions, options: PositionOptions, scene: Scene, steps
 
 
 def up_of(scene: Scene, world_from_cam: Floats) -> Floats:
-    """What points up in the world of the poses, on average: a scanner's z axis, against a camera's y axis."""
+    """The mean up direction (3,) in the world of the poses: a scanner's z axis, or a camera's y axis reversed."""
     is_camera = scene.source.frames[0].camera is not None
     up = (-world_from_cam[:, :3, 1] if is_camera else world_from_cam[:, :3, 2]).mean(axis=0)
     return np.asarray(up / max(float(np.linalg.norm(up)), 1e-9))
@@ -145,7 +145,7 @@ def _at_stamps(stamps_s: Floats, source: Source, keys: KeyFrames, max_gap_s: flo
 
 
 def _nearest_each(frame: Ints, stamps_s: Floats, frames: Sequence[Frame]) -> Ints:
-    """The rows of the positions that are nearest in time to their frames: of faster ones their noise is one's."""
+    """Rows of the position nearest in time to each frame: more of one frame would not be independent."""
     rows = np.flatnonzero(frame >= 0)
     late = np.array([abs(stamps_s[row] - frames[frame[row]].stamp_s) for row in rows])
     order = rows[np.lexsort((np.nan_to_num(late), frame[rows]))]

@@ -26,9 +26,9 @@ CALIBRATED = {"tum": "slam_refine_tum"}
 
 
 def recipe_for(frames: Path, source: Source | None = None) -> str:
-    """The recipe that refines poses of these frames, by their format; that for scans where no frame has a camera.
+    """The name of the recipe that refines poses of these frames, by their format, or by what their frames hold.
 
-    `source`: what their reader opened, where that is done already.
+    `source`: the opened frames, if they are open already.
     """
     found = guesses(frames) if frames.exists() else []
     if not found:

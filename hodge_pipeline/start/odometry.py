@@ -70,8 +70,9 @@ class OdometryStart(OdometryOptions):
         steps: Steps,
         workers: Workers,
     ) -> Scene:
-        """The scene of the key frames of `source`, their clouds made by `options`, its parts joined as `relocalise`
-        says.
+        """The scene of the key frames: components joined as `relocalise` says, loops closed by `revisits`.
+
+        `clouds` are those of the key frames, made by `options`; `found` is odometry on them.
         """
         keys = key_source(source, key_frames.rows)
         steps.remember(keys, steps.key([source, key_frames.rows]))
@@ -100,9 +101,7 @@ class OdometryStart(OdometryOptions):
 def close_loops(
     clouds: CloudSet, first: Round, part: Ints, options: Revisits, known: Edges | None = None, *, step: Step
 ) -> Closed:
-    """Step: the first poses, where the path of a part (K,) comes back to a place moved to agree with it; some loops may
-    be `known`.
-    """
+    """Step: the first poses, loops closed by revisits within each component `part (K,)`; some may be `known`."""
     found = find_revisits(clouds, first.world_from_cam, part, options, step.advance, known)
     if not len(found):
         return Closed(first.world_from_cam, found.pairs)

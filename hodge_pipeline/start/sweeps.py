@@ -37,7 +37,7 @@ from hodge_pipeline.scene import (
     stamps_of,
     vertex_ids,
 )
-from hodge_pipeline.stages import Step, Steps, Workers
+from hodge_pipeline.stages import Advance, Step, Steps, Workers
 from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
@@ -46,7 +46,8 @@ from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Floats32, Frame
 from hodge_pipeline.types.notes import Note, notes_of
 
 VOXELS_IN_REACH, KEY_FRAMES_IN_REACH = 100, 40
-"""0.8 m, as KISS-ICP (Vizzo et al., RA-L 2023) has it, and 2 m for a scanner that sees 80 m."""
+"""The reach of the scanner over the voxel and over the key-frame distance: 0.8 m, as in KISS-ICP (Vizzo et al., RA-L
+2023), and 2 m at 80 m."""
 SMALLEST_VOXEL_M = 0.08
 """Four times the usual noise of a range, 2 cm: smaller voxels, as in a room, would hold noise in place of surfaces."""
 REACH_QUANTILE = 0.99
@@ -60,9 +61,9 @@ LOOKS = 9
 MOST_SKIPPED = 20
 """Revolutions, 2 s of most scanners: numbers of files that are farther apart as a rule count something else."""
 STEPS_AROUND = 5
-"""Before and after a sweep: half a second, within which a car hardly changes its speed."""
+"""Steps before and after a sweep for its median velocity: half a second, in which a car hardly changes its speed."""
 NO_CLOCK_S = 1.0
-"""Between two sweeps that neither stamps nor times of points tell apart: velocities are then a sweep's."""
+"""Time of a step where neither stamps nor times of points give one: velocities are then per sweep."""
 
 
 @plain_dataclass(frozen=True)
@@ -119,36 +120,15 @@ def follow(
     source: Source, sequences: tuple[Ints, ...], clouds: CloudOptions, voxel_m: float | None, *, step: Step
 ) -> Sweeps:
     """Step: the poses of all sweeps, each sequence by itself. Raises `SourceError` where none has points in range."""
-    count = len(source.frames)
-    poses, velocity, stamps = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6)), stamps_of(source)
-    found, middle_s, reaches_m = np.zeros(count, bool), np.zeros(count), []
-    is_timed = False
-    loose = np.zeros(count, bool)
-    odd: list[Oddity] = []
+    count, stamps = len(source.frames), stamps_of(source)
+    poses, velocity = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6))
+    found, loose, parts = np.zeros(count, bool), np.zeros(count, bool), list[_Followed]()
     for rows in sequences:
-        frames = [source.frames[row] for row in rows]
-        reach_m, usual_turn_s = _first_look(frames, clouds)
-        reaches_m.append(reach_m)
-        times = _times(stamps[rows], usual_turn_s)
-        voxel = voxel_m or max(reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
-        first = zip(times, _sweeps(frames[:WARM_UP], clouds, reach_m), strict=False)
-        tracker = ScanToMap(voxel, first_velocity(voxel, [(at, one.cloud) for at, one in first if one.cloud]))
-        followed = []
-        for place, (row, sweep) in enumerate(zip(rows, _sweeps(frames, clouds, reach_m), strict=True)):
-            if sweep.cloud is not None:
-                tracker.follow(sweep.cloud, times[place])
-                loose[row], is_timed = tracker.is_loose, is_timed or tracker.turn_s > 0
-                middle_s[row] = tracker.turn_s / 2 + first_after_s(sweep.cloud, frames[place].stamp_s)
-                followed.append(place)
-            poses[row] = tracker.pose
-            found[row] = sweep.cloud is not None or sweep.is_copy
-            odd += [] if sweep.odd is None else [sweep.odd]
-            step.advance(1)
-        if followed:
-            last = np.searchsorted(followed, np.arange(len(rows)), side="right") - 1
-            velocity[rows] = velocities(poses[rows[followed]], times[followed])[np.maximum(last, 0)]
-            middle_s[rows] = middle_s[rows[followed]][np.maximum(last, 0)]
-            poses[rows] = poses[rows] @ se3.exp(-middle_s[rows, None] * velocity[rows])  # to the stamp
+        part = _follow_one([source.frames[row] for row in rows], stamps[rows], clouds, voxel_m, step.advance)
+        poses[rows], velocity[rows] = part.world_from_scan, part.velocity
+        found[rows], loose[rows] = part.found, part.loose
+        parts.append(part)
+    odd = [one for part in parts for one in part.odd]
     if not found.any():
         raise SourceError(f"{source.path}: none of the {count} sweeps gave points in range; the first: {odd[0]}")
     step.note(*notes_of("clouds", shortened(odd)))
@@ -159,14 +139,58 @@ def follow(
         step.note(Note(kind, int(loose.sum()), str(count)))
     clocked = [rows for rows in sequences if is_clock(stamps[rows])]
     step.note(*told_gaps(clocked, stamps, vertex_ids(source)))
-    if not is_timed:
+    if not any(part.is_timed for part in parts):
         step.note(Note("sweeps untimed"))
-    return Sweeps(poses, velocity, found, min(reaches_m))
+    return Sweeps(poses, velocity, found, min(part.reach_m for part in parts))
+
+
+class _Followed(NamedTuple):
+    """One sequence: poses (M, 4, 4) at the stamps, velocities (M, 6), which (M,) sweeps were read, where (M,) the
+    alignment was loose; whether points have times; the reach of the scanner in metres; what is odd.
+    """
+
+    world_from_scan: Floats
+    velocity: Floats
+    found: Bools
+    loose: Bools
+    is_timed: bool
+    reach_m: float
+    odd: list[Oddity]
+
+
+def _follow_one(
+    frames: list[Frame], stamps_s: Floats, clouds: CloudOptions, voxel_m: float | None, advance: Advance
+) -> _Followed:
+    count, is_timed, followed, odd = len(frames), False, list[int](), list[Oddity]()
+    poses, velocity, middle_s = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6)), np.zeros(count)
+    found, loose = np.zeros(count, bool), np.zeros(count, bool)
+    reach_m, usual_turn_s = _first_look(frames, clouds)
+    times = _times(stamps_s, usual_turn_s)
+    voxel = voxel_m or max(reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
+    first = zip(times, _sweeps(frames[:WARM_UP], clouds, reach_m), strict=False)
+    tracker = ScanToMap(voxel, first_velocity(voxel, [(at, one.cloud) for at, one in first if one.cloud]))
+    for row, sweep in enumerate(_sweeps(frames, clouds, reach_m)):
+        if sweep.cloud is not None:
+            tracker.follow(sweep.cloud, times[row])
+            loose[row], is_timed = tracker.is_loose, is_timed or tracker.turn_s > 0
+            middle_s[row] = tracker.turn_s / 2 + first_after_s(sweep.cloud, frames[row].stamp_s)
+            followed.append(row)
+        poses[row] = tracker.pose
+        found[row] = sweep.cloud is not None or sweep.is_copy
+        odd += [] if sweep.odd is None else [sweep.odd]
+        advance(1)
+    if followed:
+        last = np.maximum(np.searchsorted(followed, np.arange(count), side="right") - 1, 0)
+        velocity = velocities(poses[followed], times[followed])[last]
+        middle_s = middle_s[followed][last]
+        poses = poses @ se3.exp(-middle_s[:, None] * velocity)  # to the stamp
+    return _Followed(poses, velocity, found, loose, is_timed, reach_m, odd)
 
 
 def deskewed_along(source: Source, world_from_scan: Floats, clouds: CloudOptions, steps: Steps) -> Source:
-    """The source, sweeps whose points have times deskewed to their stamps by poses (N, 4, 4) that may be noisy: by the
-    median of the steps around each. Notes where the sweeps of a drive have no times.
+    """The source with sweeps whose points have times deskewed to their stamps, by velocities from poses (N, 4, 4).
+
+    The poses may be noisy: a velocity is the median over the steps around. Notes where sweeps in motion have no times.
     """
     velocity, stamps, is_untimed = np.zeros((len(source.frames), 6)), stamps_of(source), False
     for rows in sequences_of(source).values():
@@ -196,7 +220,9 @@ class _Sweep(NamedTuple):
 
 
 def _sweeps(frames: Iterable[Frame], clouds: CloudOptions, usual_m: float | None = None) -> Iterator[_Sweep]:
-    """Each sweep; one whose reach is far from the `usual_m` is left out too, since it has other units."""
+    """Each sweep in range; without points where it cannot be read, repeats the last one, or has a reach far from
+    `usual_m`, which means other units.
+    """
     before: Frame | None = None
     points: Floats32 = np.zeros((0, 3), np.float32)
     for frame in frames:
@@ -221,8 +247,8 @@ def _sweeps(frames: Iterable[Frame], clouds: CloudOptions, usual_m: float | None
 
 
 def _first_look(frames: list[Frame], clouds: CloudOptions) -> tuple[float, float]:
-    """How far the scanner sees and how long it turns, as a rule; all the range that is asked for where no sweep of
-    those looked at can be read.
+    """Median reach in metres and duration of a revolution in seconds (0: unknown) of a few sweeps; `max_range_m` where
+    none can be read.
     """
     looks = [s.cloud for s in _sweeps(frames[:: max(1, len(frames) // LOOKS)], clouds) if s.cloud is not None]
     looks = looks or [s.cloud for s in _sweeps(frames, clouds) if s.cloud is not None][:1]

@@ -15,8 +15,7 @@ from hodge_pipeline.types.input_files import open_input
 
 SAMPLE_SECONDS = 1.0
 GROWTH = 1.02
-"""Of the resident sizes together, from which shared pages are counted again: that costs 30 ms a process, the kernel's
-walk over its pages.
+"""Growth of the total resident size after which the PSS is measured again: the kernel takes 30 ms a process.
 """
 
 
@@ -33,14 +32,14 @@ class Cost:
 class Monitor:
     """Measures the process tree: workers that come and go are counted while they live.
 
-    Memory of several is the proportional share (PSS) where the system tells it, so that pages mapped by all count once;
-    elsewhere, and of one alone, the resident size. The share's part of that is measured whenever it has grown, and else
-    taken to be what it was.
+    Memory of several processes is the sum of their proportional set sizes (PSS), in which shared pages count once; of a
+    single one, or where the system has no PSS, the resident size (RSS). The ratio of PSS to RSS is measured when the
+    RSS has grown by `GROWTH` and reused in between.
     """
 
     _cpu_by_process: dict[tuple[int, float], float] = field(default_factory=dict)
-    _largest: float = 0.0
-    _part: float = 1.0
+    _largest_rss: float = 0.0
+    _pss_share: float = 1.0
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     @contextmanager
@@ -81,16 +80,16 @@ class Monitor:
                 alive.append(process)
             except psutil.Error:  # it ended meanwhile: its last sample stands
                 continue
-        part = 1.0
+        share = 1.0
         if len(alive) > 1:
-            if resident > GROWTH * self._largest:
-                self._largest, self._part = resident, sum(map(_memory_bytes, alive)) / resident
-            part = self._part
-        cost.peak_mb = max(cost.peak_mb, part * resident / 1e6)
+            if resident > GROWTH * self._largest_rss:
+                self._largest_rss, self._pss_share = resident, sum(map(_memory_bytes, alive)) / resident
+            share = self._pss_share
+        cost.peak_mb = max(cost.peak_mb, share * resident / 1e6)
 
 
 def _memory_bytes(process: psutil.Process) -> int:
-    """The process's share of the memory; 0 where it has ended."""
+    """The proportional set size of a process, else its resident size, in bytes; 0 where it has ended."""
     try:
         with open_input(Path(f"/proc/{process.pid}/smaps_rollup")) as rollup:
             lines = (line.split() for line in rollup)

@@ -20,10 +20,10 @@ class _OneLine(logging.Formatter):
 
 class _File(logging.FileHandler):
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - its name in `logging`
-        """A full disk stops the run where a result is written, with a line of its own; the log may miss that."""
+        """Ignore an error: a full disk stops the run where a result is written."""
 
     def close(self) -> None:
-        """Close it; what a full disk does not take of the last lines is lost."""
+        """Close the file; on a full disk its last lines are lost."""
         with suppress(OSError):
             super().close()
 

@@ -1,5 +1,5 @@
-"""How a process that works through many images holds its memory: what was freed is used again within a stage and given
-back after it, and cycles of objects are looked for seldom.
+"""Memory of a process that works through many images: freed memory is reused within a stage and returned to the system
+after it, and the garbage collector runs seldom.
 """
 
 from __future__ import annotations
@@ -10,22 +10,22 @@ import gc
 from contextlib import suppress
 
 COLLECT_AFTER = 10_000
-"""Objects made and kept before cycles are looked for, 700 by default: imports alone make and keep hundreds of
+"""Objects allocated between two garbage collections, 700 by default: imports alone make and keep hundreds of
 thousands, and looking through them takes a twelfth of the time of a run of 60 frames.
 """
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1
-"""Of glibc's `mallopt`."""
+"""Parameters of glibc's `mallopt`."""
 LARGEST_KEPT, MOST_KEPT = 1 << 26, 1 << 28
-"""Bytes of an array that is taken from the heap, and bytes free at the heap's end from which on they are given back.
+"""Bytes of the largest array taken from the heap, and free bytes at the heap's end above which they are returned.
 Images and what is made of them have 0.3 to 10 MB each, and a frame needs dozens. By default glibc gives them back when
 twice the largest of them is free, and takes them anew, cleared, for the next frame: 4 to 6 % of the time of a run.
 """
 
 
 def keep_memory() -> None:
-    """Do so from now on in this process; freed memory is given back as ever where the C library is not glibc.
+    """Collect garbage seldom and keep freed memory from now on in this process; the latter with glibc alone.
 
-    At its end no cycle is looked for: all of its objects, most of them those of imports, would be gone through twice.
+    At exit no garbage is collected, which would go twice through all objects, most of them those of imports.
     """
     gc.set_threshold(COLLECT_AFTER)
     atexit.register(gc.freeze)
@@ -36,9 +36,7 @@ def keep_memory() -> None:
 
 
 def give_back_memory(cycles: bool) -> None:
-    """Give back what was freed, wherever it lies in the heap, after a look for `cycles` of objects; nothing of the heap
-    where the C library is not glibc.
-    """
+    """Return freed memory of the heap to the system, with glibc alone; with `cycles` after a garbage collection."""
     if cycles:
         gc.collect()
     with suppress(OSError, AttributeError, TypeError):

@@ -1,4 +1,4 @@
-"""Who watches a run: the pipeline tells, the command line shows. Nobody watching is the default."""
+"""Progress of a run: the pipeline reports to a watcher, such as the command line; by default to none."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types.notes import Note
 
 RECORDING = "recording"
-"""The title of every step that only records: they are spread over the run, and make one stage for who watches."""
+"""The title of every step that only records: spread over the run, they are one stage to a watcher."""
 
 
 class Watcher(Protocol):
-    """Is told of each stage as it begins, moves and ends."""
+    """Receives the begin, progress and end of each stage, and notes."""
 
     def stage(self, title: str, total: int) -> AbstractContextManager[Advance]:
         """A context whose value is called with the units just finished, of `total` in all."""

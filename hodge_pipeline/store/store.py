@@ -33,13 +33,13 @@ from hodge_pipeline.types.notes import Note
 T = TypeVar("T")
 LIBRARIES = ("hodge-pipeline", "numpy", "scipy", "open3d", "small_gicp", "opencv-python-headless", "pycolmap")
 LAYOUT = 3
-"""Raised when steps are written in another form: those of before are computed again."""
+"""Version of the format of stored steps: raise it when the format changes, so that older ones are computed again."""
 RECORD, KEY, INDEX = "step.json", "key.txt", "index.json"
-"""Of a finished step: its key, the hash of each file, notes, cost; of a begun one: its key; of a run: its steps."""
+"""Files: record of a finished step (key, hash of each file, notes, cost); key of a begun one; list of a run's steps."""
 HASHED_AT_ONCE = 1 << 22
 """Bytes."""
 LONG_CPU_S = 10.0
-"""Of a step, after which cycles of objects are looked for too: that takes .07 s."""
+"""CPU seconds of a step after which garbage is collected too: that takes 0.07 s."""
 
 
 @cache
@@ -175,7 +175,7 @@ class Store:
         return cost
 
     def _give_back_memory(self, was_long: bool) -> None:
-        """Of what a step has read of clouds and has freed, which the next one would be charged with."""
+        """Unmap clouds and return freed memory, so that the next step is not charged with it."""
         for reference, _ in self._keys.values():
             value = reference()
             if isinstance(value, CloudSet):
@@ -303,7 +303,7 @@ def _hash(content: Any) -> str:
 
 
 def _reference(value: T) -> Callable[[], T | None]:
-    """What gives the value as long as somebody else holds it; for ever where its type allows no weak references."""
+    """A weak reference to the value; a strong one where its type allows no weak ones."""
     try:
         return weakref.ref(value)
     except TypeError:

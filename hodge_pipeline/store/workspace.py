@@ -1,4 +1,4 @@
-"""The run folder: whose it is, and who holds it."""
+"""The run folder: its recipe, and the lock that one process holds."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from hodge_pipeline.types.text import command
 RECIPE_FILE, LOCK_FILE = "recipe.yaml", ".lock"
 _DRAFT = re.compile(r"\.[^.].*\.(csv|g2o|html|json|kitti|npz|ply|rrd|tum|txt|yaml)\.[0-9]+\.draft")
 _DRAFT_FOLDER = re.compile(r"\.(recording-|sparse\.)[a-z0-9_]{8}")
-"""What `output_files` and the recording call a file or folder that is not whole yet."""
+"""Names of unfinished files and folders of `output_files` and of the recording."""
 SOLVED = "solved.json"
 """In the run folder of a solved pose-graph file."""
 RUN, REFINEMENT = "stages", "refinement"
 """The folder of the stages of a run, and of the refinement of a model."""
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, None)
-"""What the system says when a file cannot be written; None is numpy's own short write."""
+"""Error numbers when a file cannot be written; None is that of numpy's own short write."""
 
 
 def identity_of(folder: Path) -> str:
@@ -136,8 +136,8 @@ def holding(folder: Path) -> Iterator[None]:
 
 
 def _refuse_irregular(folder: Path) -> None:
-    """A run folder may be a stranger's: through a link in it what is written, or emptied, would lie elsewhere, and a
-    pipe would be waited for.
+    """Raise `WorkspaceError` for links and special files in a run folder, which may come from a stranger: writing
+    through a link would change files elsewhere, and reading a pipe would block.
     """
     for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):
@@ -152,7 +152,7 @@ def _refuse_irregular(folder: Path) -> None:
 
 
 def _remove_drafts(folder: Path) -> None:
-    """Take away what a process that was killed left between a temporary file and its name: nobody else writes here."""
+    """Remove the unfinished files of a killed process; the lock keeps other writers out."""
     for parent, folders, files in os.walk(folder):
         for name in files:
             if _DRAFT.fullmatch(name):
@@ -163,7 +163,7 @@ def _remove_drafts(folder: Path) -> None:
 
 
 def _open_lock(folder: Path) -> IO[str]:
-    """The file whose lock is the folder's; neither through a link nor by waiting."""
+    """The open lock file; links are not followed, and a pipe does not block."""
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     return os.fdopen(os.open(folder / LOCK_FILE, flags, 0o644), "r+")
 
@@ -215,7 +215,7 @@ def _is_text(path: Path, text: str) -> bool:
 
 
 def _has_stages(stages: Path) -> bool:
-    """Whether a stage was begun: a run that failed before, by a source that is not there, is nobody's work."""
+    """Whether a stage was begun: a run that failed before its first stage may be overwritten."""
     return stages.is_dir() and any(stages.iterdir())
 
 
@@ -231,7 +231,7 @@ def _first_change(old: Any, new: Any, key: str = "") -> str:
 
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
-    """A full or unwritable disk as one line."""
+    """Raises errors of a full or unwritable disk as `WorkspaceError`, in one line."""
     try:
         yield
     except OSError as error:

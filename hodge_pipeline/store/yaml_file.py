@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import lru_cache
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ MAX_NODES = 20_000
 MAX_DEPTH = 50
 """Levels: a recipe has five."""
 MAX_INT = 1 << 63
-"""No option counts so far, and Python does not write numbers of more than 4300 digits."""
+"""Larger than any option; Python refuses to print integers of more than 4300 digits."""
 
 Keys = tuple[str | int, ...]
 
@@ -93,8 +94,6 @@ def parse_value(text: str, name: str) -> Document:
 
 def dump(data: dict[str, Any]) -> str:
     """The YAML text of plain data, block style, keys in their order."""
-    from io import StringIO
-
     out = StringIO()
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = False

@@ -13,7 +13,7 @@ from hodge_pipeline.diagnosis.result import CONSISTENT, Diagnosis
 from hodge_pipeline.recording.diagnosis_file import write_diagnosis
 from hodge_pipeline.refine.pose_graph import vertex_trajectory
 from hodge_pipeline.report.diagnosis_page import PageContents, document
-from hodge_pipeline.report.diagnosis_plots import draw, side_by_side
+from hodge_pipeline.report.diagnosis_plots import draw, pieces_apart
 from hodge_pipeline.report.document import render
 from hodge_pipeline.report.edge_pictures import edge_pictures
 from hodge_pipeline.store import artifacts
@@ -36,7 +36,7 @@ def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) 
     artifacts.write_text(out / "diagnosis.html", render(document(_page(diagnosed))))
     if recording:
         identity = hashlib.sha256(np.ascontiguousarray(found.world_from_cam).tobytes()).hexdigest()[:32]
-        placed = side_by_side(found.world_from_cam, found.piece)
+        placed = pieces_apart(found.world_from_cam, found.piece)
         write_diagnosis(out / "diagnosis.rrd", identity, subject.graph, placed, found)
 
 

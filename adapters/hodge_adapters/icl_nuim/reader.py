@@ -30,13 +30,12 @@ from hodge_pipeline.types.text import counted
 
 ICL = Intrinsics(481.2, -480.0, 319.5, 239.5, (640, 480))
 REDWOOD = Intrinsics(525.0, 525.0, 319.5, 239.5, (640, 480))
+ICL_UNITS_PER_METRE, REDWOOD_UNITS_PER_METRE = 5000.0, 1000.0
 TRUTH_PATTERN = "*.gt.freiburg*"
 MAX_GAP_FRAMES = 1.0
 VIDEO_HZ = 30.0
-"""At which its frames are rendered, along a path that was walked."""
+"""Frames are rendered at this rate along a walked path."""
 SNIFFED_BYTES = 1 << 16
-
-
 COLOUR_FOLDERS = ("image", "images", "color", "rgb")
 LOG_FILES = ("trajectory.log", "scene/trajectory.log", "test_scene/trajectory.log")
 TUM_FILES = ("depth.txt", "rgb.txt", "groundtruth.txt")
@@ -112,8 +111,7 @@ class IclNuimReader:
 
     def _open_lists(self, path: Path) -> Source:
         notes: list[str] = []
-        listing = read_pairs(path, 0.0, notes)
-        return self._numbered(path, listing, notes)
+        return self._numbered(path, read_pairs(path, 0.0, notes), notes)
 
     def _open_unlisted(self, path: Path) -> Source:
         """The TUM-like layout without its list: images are paired by the numbers in their names."""
@@ -131,7 +129,7 @@ class IclNuimReader:
         without = int(np.isnan(poses[:, 0, 0]).sum())
         if without:
             notes.append(f"{without} of {len(poses)} frames have no truth")
-        frames = self._frames(listing, ICL, poses, 5000.0, notes, is_true=True)
+        frames = self._frames(listing, ICL, poses, ICL_UNITS_PER_METRE, notes, is_true=True)
         files = (*listing.files, *filter(None, [truth]), *listing.depth, *filter(None, listing.colour))
         return Source(
             path.resolve().name,
@@ -183,13 +181,13 @@ class IclNuimReader:
             notes.append(f"intrinsics from {own.relative_to(path)}")
         doubts: tuple[Note, ...] = ()
         if own is None and not self.camera:
-            stamps_s = UNSTAMPED_STEP_S * listing.stamps_s
-            doubts = assumed_camera_doubts(REDWOOD, listing.depth, listing.colour, stamps_s, self.depth_scale or 1000.0)
+            stamps_s, scale = UNSTAMPED_STEP_S * listing.stamps_s, self.depth_scale or REDWOOD_UNITS_PER_METRE
+            doubts = assumed_camera_doubts(REDWOOD, listing.depth, listing.colour, stamps_s, scale)
             notes.append(
                 "Redwood's intrinsics taken (525 525 319.5 239.5), since there is no camera file in the folder"
             )
         default = read_intrinsics(own) if own else REDWOOD
-        frames = self._frames(listing, default, poses, 1000.0, notes, is_true=False)
+        frames = self._frames(listing, default, poses, REDWOOD_UNITS_PER_METRE, notes, is_true=False)
         files = (*filter(None, [log, own]), *listing.depth, *filter(None, listing.colour))
         return Source(
             path.resolve().name, path, frames, notes=tuple(notes), files=files, doubts=doubts, numbered_hz=VIDEO_HZ
@@ -197,8 +195,8 @@ class IclNuimReader:
 
 
 def _estimated(path: Path, numbers: list[int], notes: list[str]) -> tuple[Floats, Path | None]:
-    """Poses (N, 4, 4) of these frames by `trajectory.log`, or by `pose/0.txt`, … as ScanNet has them; NaN where there
-    is none. The log, where there is one.
+    """Poses (N, 4, 4) of these frames by `trajectory.log`, or by ScanNet's `pose/0.txt`, …, NaN where there is
+    none; and the path of the log, if there is one.
     """
     log, folder = find_log(path), path / "pose"
     if log is None and not folder.is_dir():
@@ -220,14 +218,14 @@ def _find_truth(folder: Path) -> Path | None:
 
 
 def _is_numbered(association: Path) -> bool:
-    """Whether its first row has a frame number where TUM has a time."""
+    """Whether the first row of an association file has a frame number where TUM has a time."""
     lines = first_text(association, SNIFFED_BYTES).splitlines()
     row = next((line.split() for line in lines if line.strip() and not line.startswith("#")), [""])
     return row[0].isdigit()
 
 
 def is_redwood(folder: Path) -> bool:
-    """Whether the folder has a depth and a colour folder, and nothing of a TUM sequence that lost its lists."""
+    """Whether the folder has a depth and a colour folder, and no list or truth of a TUM sequence."""
     if any((folder / name).is_file() for name in TUM_FILES):
         return False
     has_colour = any((folder / name).is_dir() for name in COLOUR_FOLDERS)

@@ -17,7 +17,7 @@ from hodge_pipeline.errors import CameraError, SourceError
 from hodge_pipeline.types import Camera
 
 _ENTRY = re.compile(r"^\s*\"?(?:Camera1?\.)?(\w+)\"?\s*[:=]\s*([-+0-9.eE]+)\s*[,;]?\s*(?:#.*)?$", re.MULTILINE)
-"""Of two cameras, as ORB-SLAM3 numbers them, the first."""
+"""A line such as `fx: 525` or `Camera1.fx: 525`: of ORB-SLAM3's two cameras the first."""
 _FISHEYE = re.compile(r"^\s*\"?Camera1?\.type\"?\s*:\s*\"?(Kannala\w*)", re.MULTILINE)
 _DISTORTION = ("k1", "k2", "k3", "p1", "p2")
 CAMERA_FILES = (
@@ -35,9 +35,9 @@ CAMERA_FILES = (
     "TUM2.yaml",
     "TUM3.yaml",
 )
-"""After Open3D's JSON as ScanNet exports it, deep-video-mvs, and BundleFusion."""
+"""Usual names, also of Open3D, ScanNet's exporter, deep-video-mvs, BundleFusion and ORB-SLAM."""
 LONGEST_READOUT_S = 1.0
-"""Of a rolling shutter: slower cameras give no video."""
+"""Upper bound on a rolling shutter's read-out time: slower cameras give no video."""
 _SUPPORTED = "`fx fy cx cy [width height]` on one line, a 3x3 matrix, `fx: …` lines, or Open3D's JSON"
 
 
@@ -45,8 +45,8 @@ _SUPPORTED = "`fx fy cx cy [width height]` on one line, a 3x3 matrix, `fx: …` 
 class Intrinsics:
     """Intrinsics in pixels; `size` (width, height) and `units_per_metre` of depth where the file says so.
 
-    `distortion`: the lens's `k1 k2 p1 p2 k3` where they are known; `distorted`: that there is some; `readout_s`
-    of the rolling shutter.
+    `distorted`: the file states lens distortion; `distortion`: its `k1 k2 p1 p2 k3`, if known; `readout_s`: of the
+    rolling shutter, 0 where unknown.
     """
 
     fx: float
@@ -60,13 +60,14 @@ class Intrinsics:
     readout_s: float = 0.0
 
     def camera(self, size: tuple[int, int]) -> Camera:
-        """The camera, of the file's own size if it gives one, else of this one."""
+        """The camera, of the file's own (width, height), or of `size` where it has none."""
         width, height = self.size or size
         return Camera(width, height, self.fx, self.fy, self.cx, self.cy, self.readout_s)
 
     def camera_of(self, images: Sequence[Path], notes: list[str]) -> Camera:
-        """The camera of these images: intrinsics of another size are scaled, which is noted, where the shape is the
-        same. Raises `CameraError` where it is not.
+        """The camera of these images; intrinsics of another size are scaled, with a note.
+
+        Raises `CameraError` where the aspect ratios differ.
         """
         size = common_size(images)
         told = self.camera(size)
@@ -77,7 +78,7 @@ class Intrinsics:
         if (told.width, told.height) != size:
             notes.append(f"intrinsics of {told.width}x{told.height} are scaled to the images' {size[0]}x{size[1]}")
         camera = resized(told, size)
-        notes.extend(filter(None, [fit_note(camera)]))
+        notes.extend(filter(None, [principal_point_note(camera)]))
         return camera
 
 
@@ -113,7 +114,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
 
 
 def checked(found: Intrinsics, where: str) -> Intrinsics:
-    """The same, if it is a camera: finite, focal lengths not zero. Raises `SourceError`."""
+    """The intrinsics, unchanged. Raises `SourceError` where they are no pinhole camera."""
     pinhole = (found.fx, found.fy, found.cx, found.cy)
     scale = found.units_per_metre
     if not abs(found.readout_s) < LONGEST_READOUT_S:
@@ -125,8 +126,8 @@ def checked(found: Intrinsics, where: str) -> Intrinsics:
     return found
 
 
-def fit_note(camera: Camera) -> str | None:
-    """A complaint where the principal point lies outside the image, a sign of intrinsics of another size."""
+def principal_point_note(camera: Camera) -> str | None:
+    """A note where the principal point lies outside the image, a sign of intrinsics of another size; else None."""
     if 0 <= camera.cx <= camera.width and 0 <= camera.cy <= camera.height:
         return None
     centre = f"({camera.cx:g}, {camera.cy:g})"
@@ -163,7 +164,7 @@ def _from_info(text: str) -> Intrinsics | None:
 
 
 def _size(width: Any, height: Any) -> tuple[int, int]:
-    """Width and height in pixels, 0 for what is none."""
+    """Width and height in pixels, 0 for a value that is no whole number in range."""
     return whole(width, 1, MAX_SIDE) or 0, whole(height, 1, MAX_SIDE) or 0
 
 

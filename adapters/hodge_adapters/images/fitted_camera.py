@@ -1,4 +1,4 @@
-"""Which of several cameras took a sequence: that under which its frames agree best on how the camera moved."""
+"""Which of several cameras took a sequence: the one of least reprojection error between pairs of frames."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from hodge_pipeline.types import Bools, Bytes, Floats, Floats32
 from hodge_pipeline.types.notes import Note
 
 PAIRS, SPAN_S, HOPS = 24, 0.35, 3
-"""Pairs of frames, evenly over the sequence; how far apart, followed over so many frames between them."""
+"""Pairs of frames, evenly over the sequence; seconds between their two frames; hops of optical flow between them."""
 CORNERS, CORNER_QUALITY, CORNERS_APART_PX, BACKWARD_PX = 400, 0.005, 8.0, 0.7
 FEWEST_CORNERS, FEWEST_PAIRS = 60, 6
 RANGE_M, EDGE_STEP = (0.3, 5.0), 0.03
 LARGEST_PX = 3.0
-"""An error counts as this at most."""
+"""Cap on a reprojection error, and the gate of inliers."""
 SURE = 2.5
 """Standard errors of the mean over the pairs by which a camera must fit better."""
 TOLD = 0.95
-"""Share of the pairs in which a camera must fit better than another to be told from it: what pairs share, such as the
-read-out of the shutter, no mean over them removes. Of fr1/xyz and fr1/rpy 0.75 and 0.65 fit fr2's better.
+"""Share of the pairs in which a camera must fit better than a rival: errors that all pairs share, such as those of a
+rolling shutter, do not average out. Of fr1/xyz and fr1/rpy 0.75 and 0.65 fit fr2's better.
 """
 FOCALS = tuple(0.4 * 1.12**k for k in range(13))
 """Focal lengths over the width of the image, from 103 to 35 degrees across."""
 UNSTAMPED_STEP_S = 0.1
-"""Images without stamps are taken for every third of a video: of a slower one, pairs are far apart and not followed."""
+"""Assumed step of images without stamps, every third of a video; where they are farther apart, flow fails."""
 OTHER_FOCAL = 0.1
-"""Relative: of four cameras of known focal length images tell it to 4 %, in whatever unit depth is."""
+"""Relative error of an assumed focal length that is a doubt: of four known cameras images tell it to 4 %."""
 
 
 @dataclass(frozen=True)
 class CameraFit:
-    """By how much a camera fits better than the standard one (0.05: 5 %), and in what share of the pairs of frames the
-    best one fits better than it.
+    """`gain`: by which share a camera's error is below that of the standard one; `beaten`: the share of pairs of frames
+    in which the best camera fits better than this one.
     """
 
     gain: float
@@ -77,7 +77,7 @@ def fitting(
 
 
 def untold_camera_doubts(fits: Mapping[str, CameraFit]) -> tuple[Note, ...]:
-    """A doubt where the pairs of frames do not tell the best of these cameras from others of them."""
+    """A doubt where other cameras fit nearly as often as the best of them: by `beaten` below `TOLD`."""
     rivals = {name: fit for name, fit in list(fits.items())[1:] if fit.beaten < TOLD}
     if not rivals:
         return ()
@@ -91,9 +91,9 @@ def untold_camera_doubts(fits: Mapping[str, CameraFit]) -> tuple[Note, ...]:
 def assumed_camera_doubts(
     taken: Intrinsics, depth: Sequence[Path], colour: Sequence[Path | None], stamps_s: Floats, units_per_metre: float
 ) -> tuple[Note, ...]:
-    """A doubt unless frames agree best under the focal length of a camera that is only assumed, or one near to it.
+    """A doubt unless images confirm the focal length of an assumed camera to within `OTHER_FOCAL`.
 
-    Raises `CameraError`, with the focal length that images tell, where they have another shape than that camera's.
+    Raises `CameraError`, with the estimated focal length, where the images have another aspect ratio than the camera.
     """
     size = pixels.common_size(depth)
     told = focal_px(size, depth, colour, stamps_s, units_per_metre)
@@ -120,8 +120,8 @@ def focal_px(
     stamps_s: Floats,
     units_per_metre: float,
 ) -> float | None:
-    """The focal length, in pixels of images of this (width, height), under which frames agree best on how the camera
-    moved; None where they do not tell, as of a camera at rest.
+    """The focal length of least reprojection error, in pixels of images of this (width, height); None without a clear
+    minimum, as of a camera at rest.
     """
     width, height = size
     centre = width / 2 - 0.5, height / 2 - 0.5
@@ -147,7 +147,7 @@ def _errors(
     stamps_s: Floats,
     units_per_metre: float,
 ) -> Floats:
-    """Logarithms of the misfit (pairs, cameras), of the pairs that every camera has one of."""
+    """Logarithms of the misfit (pairs, cameras), of the pairs that have one under every camera."""
     pairs = _pairs(depth, colour, stamps_s, units_per_metre)
     errors = np.array([[_misfit(camera, pair) for camera in cameras] for pair in pairs]).reshape(-1, len(cameras))
     found: Floats = np.log(errors[np.isfinite(errors).all(axis=1)])

@@ -1,7 +1,7 @@
-"""Lazy frames of a depth image and the colour image on the same pixel grid, straight where a lens distorts.
+"""Lazy frames of a depth image and the colour image on the same pixel grid, undistorted where the lens is known.
 
-Depth that is registered to colour shares the colour image's distortion, so both are bent back alike: colour between
-its pixels, depth from the nearest one, since a depth between two surfaces is on neither.
+Depth that is registered to colour shares the colour image's distortion, so both are undistorted: colour by linear
+interpolation, depth from the nearest pixel, since a mean of two surfaces' depths is on neither.
 """
 
 from __future__ import annotations
@@ -44,9 +44,8 @@ def image_frame(
 ) -> Frame:
     """A frame that reads its images when asked, and then refuses those of another size than the camera.
 
-    With a lens they are bent straight first. Colour files of another size (`colour_size`) but the camera's shape are
-    brought to its size. A pose (4, 4) that is not finite means none; `is_true` says that it is
-    a benchmark's.
+    With a lens they are undistorted. Colour files of another size (`colour_size`) but the camera's aspect ratio are
+    resized. A pose (4, 4) that is not finite means none; with `is_true` it is the ground truth too.
     """
     pose = world_from_cam if np.isfinite(world_from_cam).all() else None
     size = camera.width, camera.height
@@ -64,7 +63,7 @@ def image_frame(
         sequence=sequence,
         colour_delay_s=colour_delay_s,
     )
-    return frame if lens is None else _straight(frame, lens, units_per_metre)
+    return frame if lens is None else _undistorted(frame, lens, units_per_metre)
 
 
 def _image_file(path: Path, camera: Camera, lens: Lens | None) -> ImageFile:
@@ -73,20 +72,20 @@ def _image_file(path: Path, camera: Camera, lens: Lens | None) -> ImageFile:
     return image_file(path, camera, "FULL_OPENCV", (*lens.distortion, 0.0, 0.0, 0.0))
 
 
-def _straight(frame: Frame, lens: Lens, units_per_metre: float) -> Frame:
+def _undistorted(frame: Frame, lens: Lens, units_per_metre: float) -> Frame:
     depth, colour = frame.read_depth, frame.read_colour
     return replace(
         frame,
-        read_depth=partial(straight_depth, depth, lens) if depth else None,
-        encoded_depth=partial(encoded_straight_depth, depth, lens, units_per_metre) if depth else None,
-        read_colour=partial(straight_colour, colour, lens) if colour else None,
-        encoded_colour=partial(encoded_straight_colour, colour, lens) if colour else None,
+        read_depth=partial(undistorted_depth, depth, lens) if depth else None,
+        encoded_depth=partial(encoded_undistorted_depth, depth, lens, units_per_metre) if depth else None,
+        read_colour=partial(undistorted_colour, colour, lens) if colour else None,
+        encoded_colour=partial(encoded_undistorted_colour, colour, lens) if colour else None,
     )
 
 
 @dataclass(frozen=True)
 class Lens:
-    """The camera that the images are to have, and its lens's `k1 k2 p1 p2 k3` (Brown's model, as OpenCV's)."""
+    """The pinhole camera of the undistorted images, and the distortion `k1 k2 p1 p2 k3` (Brown's, as in OpenCV)."""
 
     camera: Camera
     distortion: tuple[float, float, float, float, float]
@@ -94,7 +93,7 @@ class Lens:
 
 @lru_cache(maxsize=4)
 def _maps(lens: Lens) -> Maps:
-    """Where (H, W) in the distorted image each pixel of the pinhole's comes from: columns, rows."""
+    """Columns and rows (H, W) in the distorted image of each pixel of the undistorted one."""
     size = lens.camera.width, lens.camera.height
     matrix = lens.camera.matrix
     columns, rows = cv2.initUndistortRectifyMap(
@@ -103,27 +102,27 @@ def _maps(lens: Lens) -> Maps:
     return columns, rows
 
 
-def straight_depth(read: Callable[[], Floats32], lens: Lens) -> Floats32:
-    """The depth image, straight; 0 where the pinhole sees past the edge of what was measured."""
+def undistorted_depth(read: Callable[[], Floats32], lens: Lens) -> Floats32:
+    """The depth image, undistorted; 0 where the pinhole camera sees beyond the edge of the original."""
     columns, rows = _maps(lens)
     return np.asarray(cv2.remap(read(), columns, rows, cv2.INTER_NEAREST, borderValue=0.0), np.float32)
 
 
-def straight_colour(read: Callable[[], Bytes], lens: Lens) -> Bytes:
-    """The colour image, straight; black past its edge."""
+def undistorted_colour(read: Callable[[], Bytes], lens: Lens) -> Bytes:
+    """The colour image, undistorted; black beyond the edge of the original."""
     columns, rows = _maps(lens)
     return np.asarray(cv2.remap(read(), columns, rows, cv2.INTER_LINEAR), np.uint8)
 
 
-def encoded_straight_depth(read: Callable[[], Floats32], lens: Lens, units_per_metre: float) -> EncodedImage:
-    """The straight depth image as PNG, in the units that the files have."""
-    stored = np.clip(np.round(straight_depth(read, lens) * units_per_metre), 0, 65535).astype(np.uint16)
+def encoded_undistorted_depth(read: Callable[[], Floats32], lens: Lens, units_per_metre: float) -> EncodedImage:
+    """The undistorted depth image as PNG, in the units of the files."""
+    stored = np.clip(np.round(undistorted_depth(read, lens) * units_per_metre), 0, 65535).astype(np.uint16)
     return EncodedImage(encoded_depth(stored) or _encoded(".png", stored, []), "image/png", units_per_metre)
 
 
-def encoded_straight_colour(read: Callable[[], Bytes], lens: Lens) -> EncodedImage:
-    """The straight colour image as JPEG."""
-    return as_jpeg(straight_colour(read, lens))
+def encoded_undistorted_colour(read: Callable[[], Bytes], lens: Lens) -> EncodedImage:
+    """The undistorted colour image as JPEG."""
+    return as_jpeg(undistorted_colour(read, lens))
 
 
 def encoded_colour(path: Path, size: tuple[int, int]) -> EncodedImage:

@@ -1,4 +1,4 @@
-"""What a PNG or JPEG says of itself before it is decoded: its size, and whether all of it is there."""
+"""Size and completeness of a PNG or JPEG file, by its header and markers, before it is decoded."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _JPEG_BARE_MARKERS = frozenset((0x01, *range(0xD0, 0xD9)))
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What an image file says of itself; `body` is where its header ends."""
+    """Type and size in pixels of an image file; `body` is the offset at which its header ends."""
 
     media_type: str
     width: int

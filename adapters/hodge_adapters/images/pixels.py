@@ -1,4 +1,4 @@
-"""Depth and colour images from files that are not trusted: size and damage are looked for before decoding.
+"""Depth and colour images from untrusted files: size and damage are checked before decoding.
 
 All functions are module-level, so that partials of them pickle by reference and a worker process can call them.
 """
@@ -23,7 +23,7 @@ from hodge_pipeline.types.input_files import open_input, read_input
 HEADER_BYTES = 1 << 16
 """Where an image's size is looked for: room for the thumbnail that may precede it."""
 SAME_SHAPE = 0.01
-"""By which the ratio of the sides may differ: ScanNet's colour, 1296x968, and depth, 640x480, differ by 0.4 %."""
+"""Relative difference of equal aspect ratios: ScanNet's colour, 1296x968, and depth, 640x480, differ by 0.4 %."""
 MAX_IMAGE_BYTES = 1 << 29
 """Twice what 64 megapixels of 16-bit depth and their rows' heads take uncompressed."""
 
@@ -53,7 +53,7 @@ def read_depth(
 
 
 def read_colour(path: Path, *, size: tuple[int, int] | None = None) -> Bytes:
-    """Colour (H, W, 3) uint8 RGB; where it has the camera's shape in another size, brought to the camera's.
+    """Colour (H, W, 3) uint8 RGB, resized to the camera's `size` where it has the same aspect ratio.
 
     Raises `SourceError` as `read_depth` does.
     """
@@ -95,7 +95,7 @@ def read_whole_image(path: Path, size: tuple[int, int] | None = None, any_scale:
 
 
 def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether images of these (width, height) show the same view at most in another size."""
+    """Whether images of these (width, height) have the same aspect ratio, to within `SAME_SHAPE`."""
     return abs(one[0] * other[1] / (one[1] * other[0]) - 1) <= SAME_SHAPE
 
 
@@ -107,8 +107,8 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def colour_size(paths: Sequence[Path | None], size: tuple[int, int], notes: list[str]) -> tuple[int, int]:
-    """The common (width, height) of those colour images that are there, noted where it is not that of depth; that of
-    depth where none can be read.
+    """The common (width, height) of the colour images, with a note where it is not `size`, that of depth; `size` where
+    none can be read.
     """
     try:
         found = common_size([path for path in paths if path])

@@ -1,7 +1,7 @@
 """PNG by ISA-L: OpenCV's zlib takes most of the time of decoding or encoding one.
 
-ISA-L inflates three times as fast. Where all rows have the commonest filter it is undone here; else what ISA-L gave is
-put back as stored blocks, which zlib only copies, and OpenCV does the rest. Every pixel is the same.
+ISA-L inflates three times as fast. Where all rows have the filter Sub it is undone here; else the inflated data is put
+back as stored blocks, which zlib only copies, and OpenCV decodes that. The pixels are the same as OpenCV's.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ isal_zlib: Any = None
 with suppress(ImportError):  # there are no wheels for every machine
     isal_zlib = import_module("isal.isal_zlib")
 
-_SIGNATURE, _LEFT = b"\x89PNG\r\n\x1a\n", 1
-"""Of every PNG; the filter that takes the pixel to the left away."""
+_SIGNATURE, _SUB = b"\x89PNG\r\n\x1a\n", 1
+"""The first bytes of a PNG; the filter Sub, which stores differences to the pixel on the left."""
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
-"""By the colour type of a PNG."""
+"""Channels by the colour type of a PNG."""
 _STORED_BYTES = 65535
-"""Of one stored block, at most (RFC 1951)."""
+"""Largest stored block (RFC 1951)."""
 _CHUNK_FRAME, _PLAIN_START = 12, 33
-"""Bytes of length, name and checksum of a chunk; of signature and header."""
+"""Bytes of a chunk's length, name and checksum together; of signature and header chunk together."""
 _PLAIN = {(16, 0, cv2.IMREAD_UNCHANGED): 2, (8, 2, cv2.IMREAD_COLOR_RGB): 3}
-"""Bytes of a pixel, by its depth in bits, its colour type, and how it is read."""
+"""Bytes of a pixel, by its depth in bits, its colour type, and the flag of `cv2.imdecode`."""
 _Parts: TypeAlias = tuple[bytes, bytes, bytes]
 
 
@@ -38,7 +38,7 @@ def decoded(contents: bytes, how: int) -> Any:
     The file must be complete, as `headers.is_complete` says. Memory holds no more than its header announces.
     """
     parts = _inflated(contents)
-    found = None if parts is None else _summed(*parts, how)
+    found = None if parts is None else _unfiltered(*parts, how)
     if found is not None:
         return found
     return cv2.imdecode(np.frombuffer(contents if parts is None else _with_stored(*parts), np.uint8), how)
@@ -60,36 +60,36 @@ def _inflated(contents: bytes) -> _Parts | None:
     return (before, raw, after) if len(raw) == size and inflate.eof else None
 
 
-def _summed(before: bytes, raw: bytes, after: bytes, how: int) -> Any:
-    """The pixels of a depth image, or of a colour image read as RGB, all rows of which hold differences to the left and
-    which holds nothing else, as OpenCV and most cameras write them; None of any other.
+def _unfiltered(before: bytes, raw: bytes, after: bytes, how: int) -> Any:
+    """The pixels of a 16-bit depth image, or of an RGB image read as RGB, with filter Sub in every row and no further
+    chunks, as OpenCV and most cameras write them; None of any other.
     """
     width, height, *kind = struct.unpack_from(">IIBB", before, 16)
     pixel = _PLAIN.get((*kind, how))
     if pixel is None or len(before) != _PLAIN_START or len(after) != _CHUNK_FRAME:
         return None
     rows = np.frombuffer(raw, np.uint8).reshape(height, -1)
-    if (rows[:, 0] != _LEFT).any():
+    if (rows[:, 0] != _SUB).any():
         return None
     sums = np.add.accumulate(rows[:, 1:].reshape(height, width, pixel), axis=1, dtype=np.uint8)
     return sums if pixel == 3 else sums.view(">u2")[..., 0].astype(np.uint16)
 
 
 def _with_stored(before: bytes, raw: bytes, after: bytes) -> bytes:
-    """The PNG with its data stored."""
+    """The PNG with its data in stored blocks."""
     return b"".join([before, _chunk(b"IDAT", _stored(raw)), after])
 
 
 def encoded_depth(stored: NDArray[np.uint16]) -> bytes | None:
-    """A depth image (H, W) as PNG, each row less the pixel to the left; None without ISA-L: OpenCV takes thrice as long
-    for files a thirtieth smaller.
+    """A depth image (H, W) as PNG with filter Sub; None without ISA-L. OpenCV takes three times as long for files a
+    thirtieth smaller.
     """
     if isal_zlib is None:
         return None
     height, width = stored.shape
     pixels = stored.astype(">u2").view(np.uint8)
     rows = np.empty((height, 1 + 2 * width), np.uint8)
-    rows[:, 0], rows[:, 1:3] = _LEFT, pixels[:, :2]
+    rows[:, 0], rows[:, 1:3] = _SUB, pixels[:, :2]
     np.subtract(pixels[:, 2:], pixels[:, :-2], out=rows[:, 3:])
     header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
     data = isal_zlib.compress(rows, 1)
@@ -97,7 +97,7 @@ def encoded_depth(stored: NDArray[np.uint16]) -> bytes | None:
 
 
 def _data_bytes(contents: bytes) -> int:
-    """Of a PNG's pixels with the filter of each row; 0 of what is none, of an interlaced or of an animated one."""
+    """Size of a PNG's data once inflated; 0 for what is no PNG, and for an interlaced or animated one."""
     if not contents.startswith(_SIGNATURE) or b"acTL" in contents[:256]:
         return 0
     width, height, depth, colour_type, _, _, interlaced = struct.unpack_from(">IIBBBBB", contents, 16)

@@ -1,7 +1,7 @@
 """Messages of any encoding as dictionaries, and fields taken out of them by the type that they must have.
 
 ROS 2 (CDR), Foxglove protobuf and Foxglove JSON differ in names (`K` or `k`, `nanosec`, `nsec` or `nanos`) and in
-whether a zero is written at all, so an absent number is 0: what a zero makes senseless is refused where it is used.
+whether a zero is written at all, so an absent number is 0, and a zero that makes no sense is refused where it is used.
 """
 
 from __future__ import annotations
@@ -100,19 +100,17 @@ def payload_start(message: Message, contents: bytes, length: int) -> bytes:
 
 def number(message: Message, *names: str) -> float:
     """The number under the first of these names that is there, else 0; raises `Malformed` where it is no number."""
-    for name in names:
-        if name in message:
-            value = message[name]
-            if not isinstance(value, (int, float, np.number)):
-                break
-            return value  # type: ignore[return-value]
-    else:
+    name = next((name for name in names if name in message), None)
+    if name is None:
         return 0
-    raise Malformed(f"no number in its field {name}")
+    value = message[name]
+    if not isinstance(value, (int, float, np.number)):
+        raise Malformed(f"no number in its field {name}")
+    return value  # type: ignore[return-value]
 
 
 def whole(message: Message, *names: str) -> int:
-    """The same, of a whole number."""
+    """The whole number under the first of these names that is there, else 0; raises `Malformed` for any other value."""
     value = number(message, *names)
     if not math.isfinite(value) or value != int(value):
         raise Malformed(f"no whole number in its field {names[0]}")

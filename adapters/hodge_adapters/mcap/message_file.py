@@ -123,7 +123,7 @@ class MessageFile(ABC):
         """The wanted messages of the file."""
 
     def begun(self, file: IO[bytes], magic: bytes, kind: str) -> tuple[ReadAt, int]:
-        """What reads from the file, and its size. Raises `SourceError` where it does not start as its kind does."""
+        """A function that reads from the file, and the file's size. Raises `SourceError` where `magic` is missing."""
         read, size = read_at(file), os.fstat(file.fileno()).st_size
         if read(0, len(magic)) != magic:
             raise SourceError(f"{self.path}: does not start as {kind}: record or copy it again")
@@ -138,8 +138,8 @@ class MessageFile(ABC):
         self._expansion_left -= size
         return expand(read, chunk, size)
 
-    def told(self) -> str:
-        """How much was read, for what is said of a file that ends too early."""
+    def read_so_far(self) -> str:
+        """In words, how many wanted messages were read so far, for the note on a file that ends too early."""
         used = self._of_use
         if not used.count:
             return "no message of use"

@@ -1,4 +1,4 @@
-"""Where the camera was: odometry or poses, moved from the body to the camera by the transforms, or those alone."""
+"""Poses of the camera: from odometry or pose topics, moved from body to camera by /tf, or from /tf alone."""
 
 from __future__ import annotations
 

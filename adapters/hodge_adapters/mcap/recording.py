@@ -47,8 +47,8 @@ NO_PINHOLE = "a matrix K that is no pinhole camera's"
 
 @dataclass(frozen=True)
 class Seen(Generic[Layout]):
-    """One image or cloud of a topic: when, in which coordinate frame, how to read it and where; and how often the
-    clock had jumped back by then.
+    """One image or cloud of a topic: its times and coordinate frame, how its bytes are laid out and where they lie;
+    `run` counts the jumps of the clock back in time before it.
     """
 
     stamp_s: float
@@ -141,7 +141,7 @@ class Recording:
         return stamp
 
     def clock_note(self) -> str | None:
-        """Says so where headers and log are on different clocks."""
+        """A note where header stamps and log times are of different clocks, else None."""
         if not len(self.clock_differences_s):
             return None
         difference_s = float(np.median(np.frombuffer(self.clock_differences_s, float)))
@@ -173,7 +173,7 @@ def kind_of(schema_name: str) -> Add | None:
 def _adds(
     of: Callable[[Recording], dict[str, list[Seen[Layout]]]], layout_of: Callable[[Message, int, bytes], Layout]
 ) -> Add:
-    """What adds an image or a cloud, whose layout is told by the message, its payload's length and its bytes."""
+    """A function that adds an image or a cloud; `layout_of` takes the message, its payload's length and its bytes."""
 
     def add(recording: Recording, message: Message, path: Path, logged: Logged) -> None:
         stamp = recording.stamp(message, logged)

@@ -1,4 +1,4 @@
-"""Which topics are the depth, its colour and its calibration: by what they hold, or as the options name them."""
+"""The topics of depth, colour and calibration: by their contents, or as the options name them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from hodge_adapters.association import clock_runs
-from hodge_adapters.images.camera_files import fit_note
+from hodge_adapters.images.camera_files import principal_point_note
 from hodge_adapters.mcap.images import ImageLayout
 from hodge_adapters.mcap.recording import Calibration, Recording, Seen
 from hodge_adapters.text_rows import listed
@@ -147,7 +147,7 @@ def _camera(name: str, calibration: Calibration, topic: str, layout: ImageLayout
     notes.append(f"{topic}: intrinsics from {name}{' (rectified: P)' if is_rectified else ''}")
     if calibration.is_distorted and not is_rectified:
         notes.append(f"{name}: has lens distortion, which is not corrected: images are taken as undistorted")
-    notes.extend(filter(None, [fit_note(camera)]))
+    notes.extend(filter(None, [principal_point_note(camera)]))
     return camera
 
 

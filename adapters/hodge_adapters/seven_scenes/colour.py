@@ -1,4 +1,4 @@
-"""Colour of a Kinect, whose camera is beside the depth camera: told by edges, and brought onto the depth's pixels."""
+"""Unregistered colour of a Kinect: detected by edges, and reprojected onto the pixels of the depth image."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from hodge_pipeline.types import Bytes, Camera, EncodedImage, Floats, Floats32
 from hodge_pipeline.types.arrays import evenly
 
 COLOUR_FOCAL, BASELINE_M = 525.0, 0.025
-"""Of a Kinect's colour camera as built: parallel to the depth camera, which sees it at its left."""
+"""Focal length in pixels and baseline of a Kinect's colour camera as built: parallel to the depth camera."""
 SIZE = 640, 480
 ASSUMED_DEPTH_M = 2.0
-"""Where a whole image has no depth."""
+"""Depth that an image without any is taken to have."""
 MEDIAN_STRIDE = 4
-"""Pixels between two of those whose median depth the others get: all of them would take as long as the rest."""
+"""Every so many rows and columns are used for the median depth: all would take as long as the rest."""
 FRAMES, FEWEST_FRAMES, FEWEST_EDGES = 8, 3, 100
-"""That are looked at, evenly spread, to tell the camera; the last: pixels of an image at edges of its depth."""
+"""Frames tested, evenly spread; frames that are needed; pixels at depth edges that a frame needs."""
 EDGE_STEP = 0.05
-"""Share of the nearer depth by which neighbours at an edge differ."""
+"""Share of the nearer depth by which neighbouring pixels differ at a depth edge."""
 LEAST_CHANGE = 1.0
-"""Grey levels, for noise: an image of one even shade says nothing."""
+"""Grey levels added for noise, so that an image of one even shade has no say."""
 SURE = 2.5
-"""Standard errors of the mean over the frames. Red kitchen's and stairs' frames have 7 to 10 for a camera beside;
-fr1/xyz, fr1/rpy, fr3/cabinet and ICL-NUIM, whose colour lies on depth, 0 to 13 against it.
+"""Standard errors of the mean over the frames that show unregistered colour. Red kitchen and stairs have 7 to 10;
+fr1/xyz, fr1/rpy, fr3/cabinet and ICL-NUIM, whose colour is registered, 0 to −13.
 """
 
 
 @dataclass(frozen=True)
 class DepthFile:
-    """A depth image, the depth camera, the stored units of a metre, and the values that mean no depth."""
+    """A depth image, the depth camera, stored units per metre, and the values that mean no depth."""
 
     path: Path
     camera: Camera
@@ -57,9 +57,10 @@ class DepthFile:
         )
 
 
-def is_beside(colour: Sequence[Path], depth: Sequence[DepthFile]) -> bool:
-    """Whether colour surely changes more where a Kinect's colour camera would see the edges of depth than where the
-    depth camera sees them. Images that cannot be read are left out; False where too few are left.
+def is_unregistered(colour: Sequence[Path], depth: Sequence[DepthFile]) -> bool:
+    """Whether colour edges surely fit depth edges better as seen by a Kinect's colour camera than without parallax.
+
+    Images that cannot be read are left out; False where too few are left.
     """
     if len(depth) < FEWEST_FRAMES or depth[0].size != SIZE:
         return False
@@ -75,15 +76,15 @@ def is_beside(colour: Sequence[Path], depth: Sequence[DepthFile]) -> bool:
 
 
 def _gain(depth_m: Floats32, colour: Bytes, camera: Camera) -> float:
-    """Logarithm of the mean change of grey values along rows where the colour camera sees edges of depth, over that
-    where the depth camera sees them; NaN of too few edges.
+    """Logarithm of the mean gradient of colour at depth edges as a Kinect's colour camera sees them, over that at their
+    own pixels; NaN with too few edges.
     """
     grey = cv2.blur(cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), (3, 3))
     change = np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0))
     left, right = depth_m[:, :-1], depth_m[:, 1:]
     nearer = np.minimum(left, right)
     v, u = np.nonzero((nearer > 0) & (np.abs(left - right) > EDGE_STEP * nearer))
-    far = _seen_far(np.asarray(u + 0.5, float), v.astype(float), camera)
+    far = _at_infinity(np.asarray(u + 0.5, float), v.astype(float), camera)
     columns = np.round(far[0] - COLOUR_FOCAL * BASELINE_M / nearer[v, u]).astype(np.int64)
     rows = np.round(far[1]).astype(np.int64)
     inside = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
@@ -93,8 +94,8 @@ def _gain(depth_m: Floats32, colour: Bytes, camera: Camera) -> float:
     return float(np.log((beside + LEAST_CHANGE) / (here + LEAST_CHANGE)))
 
 
-def _seen_far(u: Floats, v: Floats, camera: Camera) -> tuple[Floats, Floats]:
-    """Columns and rows at which the colour camera sees pixels of the depth camera that look at something far."""
+def _at_infinity(u: Floats, v: Floats, camera: Camera) -> tuple[Floats, Floats]:
+    """Columns and rows in the colour camera of pixels of the depth camera at infinite depth, without parallax."""
     wider_u, wider_v = COLOUR_FOCAL / camera.fx, COLOUR_FOCAL / camera.fy
     return wider_u * (u - camera.cx) + camera.cx, wider_v * (v - camera.cy) + camera.cy
 
@@ -104,23 +105,23 @@ def colour_pixels(depth_m: Floats32, camera: Camera) -> tuple[Floats32, Floats32
     some = depth_m[::MEDIAN_STRIDE, ::MEDIAN_STRIDE]
     known = some[some > 0]
     middle = np.median(known) if len(known) else ASSUMED_DEPTH_M
-    columns, rows = _all_seen_far(camera)
+    columns, rows = _all_at_infinity(camera)
     parallax = np.float32(COLOUR_FOCAL * BASELINE_M) / np.where(depth_m > 0, depth_m, np.float32(middle))
     return np.asarray(columns - parallax, np.float32), rows
 
 
 @lru_cache(maxsize=2)
-def _all_seen_far(camera: Camera) -> tuple[Floats32, Floats32]:
+def _all_at_infinity(camera: Camera) -> tuple[Floats32, Floats32]:
     v, u = np.indices((camera.height, camera.width), dtype=float)
-    columns, rows = _seen_far(u, v, camera)
+    columns, rows = _at_infinity(u, v, camera)
     return columns.astype(np.float32), rows.astype(np.float32)
 
 
 def read_registered_colour(path: Path, depth: DepthFile) -> Bytes:
-    """Colour (H, W, 3) of a Kinect on the pixels of its depth image: black where the colour camera does not look.
+    """Colour (H, W, 3) of a Kinect on the pixels of its depth image, black outside the colour camera's view.
 
-    Pixels without depth are taken to be as far as the median of the others. What the colour camera cannot see from
-    where it stands gets the colour of what hides it: at 2.5 cm beside, a rim of a few pixels.
+    Pixels without depth get the median depth. Points hidden from the colour camera get the colour of what hides them:
+    a rim of a few pixels at a baseline of 2.5 cm.
     """
     image = pixels.read_colour(path, size=depth.size)
     seen = colour_pixels(_read_last(depth, _changed(depth.path)), depth.camera)
@@ -128,7 +129,7 @@ def read_registered_colour(path: Path, depth: DepthFile) -> Bytes:
 
 
 def encoded_registered_colour(path: Path, depth: DepthFile) -> EncodedImage:
-    """The same as JPEG."""
+    """The image of `read_registered_colour` as JPEG."""
     return as_jpeg(read_registered_colour(path, depth))
 
 

@@ -1,8 +1,8 @@
 """7-Scenes, and 3DMatch's copies of it: `seq-01/frame-000000.{color,depth,pose}.*`, poses camera to world.
 
 Depth is uint16 millimetres, where both 0 and 65535 mean no depth. Depth and colour are, as the data set's authors say,
-not calibrated to each other: colour is brought onto the depth's pixels as a Kinect is built, unless edges speak for
-images that are calibrated, as those of re-exports.
+not registered to each other: colour is reprojected onto the depth's pixels as a Kinect is built, unless edges show that
+it is registered, as in re-exports.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from hodge_adapters.images.frames import image_frame
 from hodge_adapters.seven_scenes.colour import (
     DepthFile,
     encoded_registered_colour,
-    is_beside,
+    is_unregistered,
     read_depth,
     read_registered_colour,
 )
@@ -68,9 +68,9 @@ class SevenScenesReader:
     )
     colour_camera: Literal["auto", "same", "kinect"] = Field(
         "auto",
-        description="where colour was seen from: same as depth, as if they were calibrated; kinect: 525 pixels and "
-        "2.5 cm beside, as the sensor is built; auto: kinect where colour changes more at edges of depth then, which "
-        "a few images tell (red kitchen: 2.6 to 3.5 times as much as elsewhere, in place of 1.3)",
+        description="the camera of the colour images: same as depth, as registered images have it; kinect: 525 pixels, "
+        "2.5 cm beside, as the sensor is built; auto: kinect where colour then changes more at depth edges, by a "
+        "few images (red kitchen: 2.6 to 3.5 times as much as elsewhere, in place of 1.3)",
     )
 
     def sniff(self, path: Path) -> Sniff:
@@ -100,7 +100,7 @@ class SevenScenesReader:
         camera, camera_files = self._camera(path, usable, notes)
         colours = [files.paths.get("color") for files in usable]
         colour_size = pixels.colour_size(colours, (camera.width, camera.height), notes)
-        is_beside = self._is_beside(usable, camera, notes)
+        is_unregistered = self._is_unregistered(usable, camera, notes)
         poses = read_poses(usable, notes)
         several = len({files.sequence for files in usable}) > 1
         taken = [row for row, files in enumerate(usable) if files.rank % self.every == 0]
@@ -108,7 +108,7 @@ class SevenScenesReader:
             name=path.resolve().name,
             path=path,
             frames=tuple(
-                self._frame(usable[row], camera, poses[row], several, colour_size, is_beside) for row in taken
+                self._frame(usable[row], camera, poses[row], several, colour_size, is_unregistered) for row in taken
             ),
             trajectory=None if several else _trajectory(usable, poses),
             notes=tuple(notes),
@@ -154,16 +154,17 @@ class SevenScenesReader:
         camera = found.camera_of(depth, notes)
         return camera, tuple(beside[:1])
 
-    def _is_beside(self, usable: Sequence[FrameFiles], camera: Camera, notes: list[str]) -> bool:
-        """Whether colour is that of a camera beside the depth camera."""
+    def _is_unregistered(self, usable: Sequence[FrameFiles], camera: Camera, notes: list[str]) -> bool:
+        """Whether colour is unregistered, of a Kinect's colour camera beside the depth camera."""
         if self.colour_camera != "auto":
             return self.colour_camera == "kinect"
         both = [files for files in usable if "color" in files.paths]
-        found = is_beside([files.paths["color"] for files in both], [self._depth(files, camera) for files in both])
+        depth = [self._depth(files, camera) for files in both]
+        found = is_unregistered([files.paths["color"] for files in both], depth)
         if found:
             notes.append(
-                "colour is of a camera 2.5 cm beside the depth camera, a Kinect's, which edges tell: it is brought "
-                "onto depth's pixels (colour_camera=same: it is not)"
+                "colour is not registered to depth, as edges in both show: it is reprojected from a Kinect's colour "
+                "camera, 2.5 cm beside the depth camera (colour_camera=same takes it as registered)"
             )
         return found
 
@@ -174,7 +175,7 @@ class SevenScenesReader:
         pose: Floats,
         several: bool,
         colour_size: tuple[int, int],
-        is_beside: bool,
+        is_unregistered: bool,
     ) -> Frame:
         frame = image_frame(
             f"{files.sequence}/{files.number:06d}" if several else files.number,
@@ -189,7 +190,7 @@ class SevenScenesReader:
             sequence=files.sequence,
             colour_size=colour_size,
         )
-        if not is_beside or "color" not in files.paths:
+        if not is_unregistered or "color" not in files.paths:
             return frame
         colour, depth = files.paths["color"], self._depth(files, camera)
         return replace(

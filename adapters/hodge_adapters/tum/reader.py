@@ -79,8 +79,8 @@ class TumReader:
     )
     undistort: bool = Field(
         True,
-        description="bend the images straight where the lens's distortion is known: of fr1 and fr2, as the benchmark "
-        "publishes it, or by k1 k2 p1 p2 k3 of a camera file. It reaches 8 pixels in the corners; about 4 ms an image",
+        description="undistort the images where the lens is known: of fr1 and fr2, as the benchmark publishes it, or "
+        "by k1 k2 p1 p2 k3 of a camera file. Distortion reaches 8 pixels in the corners; about 4 ms an image",
     )
     every: int = Field(1, ge=1, description="take every n-th frame")
 
@@ -119,15 +119,15 @@ class TumReader:
         lens = Lens(camera, found.distortion) if found.distortion and self.undistort else None
         if found.distortion:
             notes.append(
-                f"the lens's distortion is {'taken out of the images' if lens else 'left in: undistort is off'}"
+                f"lens distortion is {'removed from the images' if lens else 'left in the images: undistort is off'}"
             )
         trajectory, truth_file = self._truth(path, listing.stamps_s, notes)
         poses = self._poses(trajectory, listing, notes)
-        told = {"units_per_metre": scale, "no_depth": self.no_depth, "is_true": True, "lens": lens}
+        options = {"units_per_metre": scale, "no_depth": self.no_depth, "is_true": True, "lens": lens}
         return Source(
             name=path.resolve().name,
             path=path,
-            frames=listing.frames(camera, poses, self.every, notes, **told),
+            frames=listing.frames(camera, poses, self.every, notes, **options),
             trajectory=trajectory,
             notes=tuple(notes),
             doubts=tuple(doubts),
@@ -172,7 +172,7 @@ class TumReader:
         return CAMERAS["default"], ()
 
     def _tried(self, listing: StampedImages) -> dict[str, CameraFit]:
-        """The known cameras that fit the images better than the default one, the best first."""
+        """The known cameras that surely fit the images better than the default one, the best first."""
         if pixels.common_size(listing.depth) != CAMERAS["default"].size:
             return {}
         scale = self.depth_scale or UNITS_PER_METRE

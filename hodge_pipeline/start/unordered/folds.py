@@ -1,7 +1,7 @@
-"""Unfold scenes in which look-alike places were merged: free space in depth images shows that they are distinct.
+"""Undo perceptual aliasing: look-alike places that were merged are told apart by free space in depth images.
 
-Each edge of a fold may be flawless, and all of them agree; but frames that no edge joins are brought together too, and
-one camera then sees through what the other saw.
+The wrong edges may fit and agree with each other; but frames that no edge joins are brought together as well, and one
+camera then sees through the surface that another saw.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from hodge_pipeline.types.arrays import evenly
 MOST_PAIRS = 5000
 """Pairs of frames looked at: about a second."""
 FOLDED_SHARE = 0.005
-"""Of the pairs that see each other's space; noisy cameras and objects that were moved stay below a tenth of it."""
+"""Share of pairs in free-space conflict above which a scene is folded; noise and moved objects stay below a tenth."""
 CERTAIN = 2.0
-"""Times the violation at which a hypothesis is refused: no noise explains it."""
+"""Times `MOST_VIOLATION`: a violation that no noise explains."""
 MOST_CUTS = 6
 SURE = np.inf
 
 
 @dataclass(frozen=True)
 class Pieces:
-    """The edges that are trusted, the piece (N,) of each frame, its pose in it (N, 4, 4), and what was found."""
+    """The trusted edges, the component `piece (N,)` of each frame, its pose (N, 4, 4) in that component, and notes."""
 
     graph: ViewGraph
     piece: Ints
@@ -40,13 +40,13 @@ class Pieces:
 
     @classmethod
     def kept(cls, graph: ViewGraph, diagnosis: Diagnosis) -> Pieces:
-        """What is left of a graph when the diagnosis has spoken."""
+        """The components and poses of the edges that the diagnosis keeps."""
         return cls(graph.select(diagnosis.kept), diagnosis.piece, diagnosis.world_from_cam)
 
 
 @dataclass(frozen=True)
 class Contradictions:
-    """Pairs (C, 2) of one piece of which one camera saw through what the other saw, and of how many they are."""
+    """Pairs (C, 2) of one component in free-space conflict, and of how many pairs they are."""
 
     pairs: Ints
     looked_at: int
@@ -60,10 +60,10 @@ class Contradictions:
 def contradictions(
     clouds: CloudSet, pieces: Pieces, held: Ints, view_of: ViewOf, room_m: float = 1.0
 ) -> Contradictions:
-    """What free space says of frames that the poses bring together, whether an edge joins them or not; `room_m` is what
-    a metre of a room is in this scene.
+    """Free-space conflicts between frames of one component, whether an edge joins them or not.
 
-    Frames of one part `held (N,)` by odometry are left out: what contradicts there has drifted, and looks like nothing.
+    Pairs within a component `held (N,)` of odometry are left out: their conflicts are drift, not aliasing. `room_m`
+    multiplies margins that are for rooms.
     """
     rows = np.flatnonzero(clouds.sizes > 0)
     i, j = np.triu_indices(len(rows), 1)
@@ -85,7 +85,7 @@ def unfolded(
     options: DiagnosisOptions,
     room_m: float = 1.0,
 ) -> Pieces:
-    """The pieces, cut where they hold frames that contradict each other; the first `given` edges are cut last."""
+    """The components, cut until frames in conflict are apart; the first `given` edges are cut last."""
     held = connected_components(pieces.graph.edges[:given], len(pieces.piece))
     found = contradictions(clouds, pieces, held, view_of, room_m)
     if not found.folded:
@@ -105,7 +105,7 @@ def unfolded(
         if not found.folded:
             break
         forbidden = np.unique(np.concatenate([forbidden, found.pairs]), axis=0)
-    left = f", {len(found.pairs)} still do" if len(found.pairs) else ""
+    left = f", {len(found.pairs)} pairs still contradict each other" if len(found.pairs) else ""
     note = (
         f"places that look alike lay on each other: of {first.looked_at} pairs of frames that see the same space "
         f"{len(first.pairs)} contradict each other (one camera saw through the other's surface); "
@@ -116,7 +116,7 @@ def unfolded(
 
 
 def within_parts(edges: Ints, strength: Floats, forbidden: Ints, count: int) -> Bools:
-    """Which edges (E, 2) stay: they join `count` vertices, the strongest first, to parts without a forbidden pair."""
+    """Which edges (E, 2) stay: added strongest first, unless they would connect a `forbidden` pair of vertices."""
     part = np.arange(count)
     enemies: list[set[int]] = [set() for _ in range(count)]
     for i, j in forbidden.tolist():

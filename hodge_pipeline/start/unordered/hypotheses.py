@@ -24,20 +24,21 @@ POINTS_PROJECTED = 1500
 POINTS_KEPT = 256
 """Clouds whose points are in memory, 36 kB each."""
 LEAD_SIGMAS = 2.0
-"""Of the Poisson noise of a count: how far a motion's matches must exceed those of the best other motion."""
+"""By how many sigmas of Poisson noise the inliers of a motion must exceed those of its rival."""
 ANOTHER_M, ANOTHER_RAD = 0.3, np.radians(10.0)
-"""Metres in a room and radians from which two refined motions are two: refinement forgives no more."""
+"""Metres in a room and radians from which two refined motions count as different: ICP converges over no more."""
 LEAST_SPREAD = 0.025
-"""Of the information on translation in its weakest direction: wrong matches of a bare hill have 0.009 to 0.023, streets
-0.04 and more.
+"""Share of the information on translation in its weakest direction: wrong matches of a bare hill have 0.009 to 0.023,
+streets 0.04 and more.
 """
 RIVAL_OVERLAP, RIVAL_VIOLATION = 0.8, 2.0
-"""Of the best motion's: in bare rooms, turned by a half or a quarter, a wrong one has 0.84 to 1.1 of the right overlap,
-since rings of a scanner fit each other; in furnished ones it is seen through by 4 to 20 times as much.
+"""Times the overlap, and the violation, of the best motion, for a rival to fit as well. In bare rooms a wrong motion,
+turned by a half or a quarter, has 0.84 to 1.1 of the right overlap, since rings of a scanner fit each other; in
+furnished ones it has 4 to 20 times the violation.
 """
 AMBIGUOUS, NO_LEAD = "it fits in several ways", "another motion explains as many matches"
 USUAL_TIMES = 12.0
-"""Times what the best quarter of a run's pairs has: where places look alike, most pairs are wrong."""
+"""Limit on violation and hue conflict, times the lower quartile of the run: at least a quarter is taken as right."""
 LEAST_VIOLATION, MOST_VIOLATION = 0.03, 0.15
 """Bounds on the share of the points in view that the other depth image may have seen through. Places that look alike
 differ in what surrounds them.
@@ -55,13 +56,11 @@ def weigh(
     limits: HypothesisLimits,
     workers: Workers,
 ) -> Edges:
-    """A row for each pair that was matched: its best motion, refined, which counts where it is good enough to be judged
-    with the others.
+    """A row for each matched pair: its best motion, refined by ICP, with status used where it may be an edge.
 
     `folder` holds the clouds. `overlap` is the share of the smaller cloud near the other. Of several motions of a pair
-    each is refined, and what the clouds show decides: another that fits as well makes the pair ambiguous. Where a
-    registrar gives but one, it is refused where hardly more matches explain it than its rival: places look alike there,
-    or what the clouds share lets them slide.
+    each is refined and scored by the clouds; another that fits as well makes the pair ambiguous. A single motion is
+    rejected where its inliers do not lead its rival's: places look alike, or surfaces slide.
     """
     clouds = CloudSet.open(folder)
     _, pair, motions = np.unique(matches.pairs, axis=0, return_inverse=True, return_counts=True)
@@ -89,14 +88,14 @@ def weigh(
 
 
 def _leads(count: Ints, rival: Ints) -> Bools:
-    """Where clearly more matches explain a motion than another."""
+    """Where a motion has clearly more inliers than its rival."""
     return np.asarray(count - rival >= LEAD_SIGMAS * np.sqrt(rival))
 
 
 @dataclass(frozen=True)
 class _Evidence:
-    """What the clouds show of motions (P,): overlap, the share seen through, and hue conflicts, both NaN where untold;
-    the distance of common points, metres; whether these leave a direction of translation open.
+    """Evidence of the clouds on motions (P,): overlap; shares of free-space violations and of hue conflicts, NaN where
+    unknown; RMS distance of common points in metres; whether a direction of translation is unconstrained.
     """
 
     overlap: Floats
@@ -106,7 +105,7 @@ class _Evidence:
     slides: Bools
 
     def reasons(self, best: Ints, limits: HypothesisLimits) -> NDArray[np.str_]:
-        """Why each motion is refused, an empty word where it is not; the rows `best` say what is usual in this run."""
+        """Why each motion is rejected, empty where it is not; limits are relative to the rows `best`."""
         out = np.full(len(self.hue), "", "U64")
         out[self.hue > allowed_hue_conflict(self.hue[best])] = "their colours differ"
         violated = self.seen_through > allowed_violation(self.seen_through[best])
@@ -141,33 +140,32 @@ def _differs(edges: Edges, mine: Ints, limits: HypothesisLimits) -> Bools:
 
 
 def _supported(edges: Edges, pair: Ints, best: Ints, leads: Bools, limits: HypothesisLimits) -> Bools:
-    """The rows of pairs of which a motion that became the best one led its rival at some scale."""
-    became = ~_differs(edges, best[pair], limits) & (edges.correspondences > 0)
-    return np.isin(pair, pair[became & leads])
+    """Rows of pairs where a motion that was refined to the best one had clearly more inliers than its rival."""
+    same = ~_differs(edges, best[pair], limits) & (edges.correspondences > 0)
+    return np.isin(pair, pair[same & leads])
 
 
 def _ambiguous(
     edges: Edges, pair: Ints, best: Ints, seen_through: Floats, inliers: Ints, limits: HypothesisLimits
 ) -> Bools:
-    """Which of the `best` rows have a rival of their pair: another motion that may be an edge, and fits as well.
-
-    Free space decides; where it says nothing, the count of matches does.
+    """Which of the `best` rows have another motion of their pair that may be an edge and fits as well: by overlap and
+    free space, or by inliers where free space is unknown.
     """
     mine = best[pair]
     fits = edges.overlap >= RIVAL_OVERLAP * edges.overlap[mine]
-    told = np.isfinite(seen_through) & np.isfinite(seen_through[mine])
+    known = np.isfinite(seen_through) & np.isfinite(seen_through[mine])
     as_free = seen_through <= np.maximum(RIVAL_VIOLATION * seen_through[mine], LEAST_VIOLATION)
-    fits &= np.where(told, as_free, ~_leads(inliers[mine], inliers))
+    fits &= np.where(known, as_free, ~_leads(inliers[mine], inliers))
     return np.isin(pair[best], pair[edges.counts & edges.counts[mine] & _differs(edges, mine, limits) & fits])
 
 
 def allowed_violation(seen_through: Floats) -> float:
-    """The violation up to which a pair may be right, from those (P,) of a run, a quarter of which are right."""
+    """The greatest violation of a right pair, from those (P,) of a run, assuming that a quarter are right."""
     return min(_allowed(seen_through, LEAST_VIOLATION), MOST_VIOLATION)
 
 
 def allowed_hue_conflict(conflicts: Floats) -> float:
-    """The hue conflict up to which a pair may be right, from those (P,) of a run, a quarter of which are right."""
+    """The greatest hue conflict of a right pair, from those (P,) of a run, assuming that a quarter are right."""
     return _allowed(conflicts, LEAST_HUE_CONFLICT)
 
 

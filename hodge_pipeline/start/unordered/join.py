@@ -26,33 +26,27 @@ class UnorderedStart(GlobalStart):
     """Matches frames or scans without a guess; nothing is taken from the order of the files or their stamps."""
 
     def begin(self, source: Source, clouds: CloudOptions, steps: Steps, workers: Workers) -> Scene:
-        """Every frame of the source with its cloud and the pose that the evidence joins it at."""
+        """Every frame of the source with its cloud and its pose by global registration."""
         made = make_clouds(source, landmarks_for(clouds, self), steps, workers)
-        first = _round(source, made, None, None, self, steps, workers)
+        first = join_parts(source, made, None, None, self, steps, workers)
         key_frames = KeyFrames.all_of(source, first.world_from_cam)
         return Scene(source, source, key_frames, made, first, in_order=False)
 
 
 def join_parts(
-    source: Source, clouds: CloudSet, first: Round, drift: Drift, options: GlobalStart, steps: Steps, workers: Workers
-) -> Round:
-    """The parts of the first round, those of its edges, joined without a guess where the evidence allows.
-
-    Within a part a match counts only as far as odometry may have drifted.
-    """
-    return _round(source, clouds, first, drift, options, steps, workers)
-
-
-def _round(
     source: Source,
     clouds: CloudSet,
-    known: Round | None,
+    first: Round | None,
     drift: Drift | None,
     options: GlobalStart,
     steps: Steps,
     workers: Workers,
 ) -> Round:
-    edges = None if known is None else known.edges
+    """The first round with its components, or all frames where it is None, joined by global registration.
+
+    Within a component a match counts only as far as odometry may have drifted (`drift`).
+    """
+    edges = None if first is None else first.edges
     total = 2 * len(source.frames)
     found = steps.step(
         start_without_guess, source, clouds, edges, drift, options,
@@ -71,21 +65,21 @@ def start_without_guess(
     workers: Workers,
     step: Step,
 ) -> Start:
-    """Step: the start that the evidence of matches allows; `edges` and `drift` of odometry are kept where given."""
+    """Step: the poses by global registration; where no two components of odometry are joined, those of odometry."""
     assert clouds.folder is not None
     frames = Frames(source.frames, clouds.folder, vertex_ids(source), edges, drift)
     scratch = step.folder / "scratch"
     found = find_start(frames, options, scratch, workers, step.advance)
     shutil.rmtree(scratch, ignore_errors=True)
     step.note(*found.notes)
-    if edges is not None and drift is not None and _stays(source, edges, found):
+    if edges is not None and drift is not None and _keeps_odometry(source, edges, found):
         step.note(Note("left apart"))
         return replace(found, edges=edges, world_from_cam=drift.world_from_cam)
     return found
 
 
-def _stays(source: Source, edges: Edges, found: Start) -> bool:
-    """Whether of several parts no two were joined, and none lies behind a hole, over which no motion can be guessed."""
+def _keeps_odometry(source: Source, edges: Edges, found: Start) -> bool:
+    """Whether no two of several components were joined, and no hole in the stamps makes odometry's layout a guess."""
     parts = connected_components(edges.pairs, len(source.frames))
     if len(np.unique(parts)) == 1:
         return False

@@ -1,4 +1,4 @@
-"""Loops of a path by what its frames look like, however far odometry has drifted between them."""
+"""Loop closures by appearance, however far odometry has drifted between the frames."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def is_worth_it(clouds: CloudSet, odometry: Edges, drift: Drift, revisits: Revis
 
 
 def is_long(clouds: CloudSet, odometry: Edges, drift: Drift, revisits: Revisits) -> bool:
-    """Whether the path is so long that a place may be farther off than `revisits` looks."""
+    """Whether drift along the path may exceed the reach of `revisits`, which is metric."""
     range_m = median_range_m(clouds, np.flatnonzero(clouds.sizes > 0))
     i, j = odometry.pairs.T
     way_m = displacement_m(se3.inverse(drift.world_from_cam[i]) @ drift.world_from_cam[j], range_m).sum()
@@ -47,9 +47,9 @@ def find_loops(
     workers: Workers,
     step: Step,
 ) -> Edges:
-    """Step: loops between frames, one a stretch of `revisits.every_m` of the path, whose landmarks match.
+    """Step: loop closures by matched landmarks, between one frame per `revisits.every_m` metres of the path.
 
-    A loop counts where odometry does not contradict it, and together with the others on odometry as their backbone.
+    Those are kept that the diagnosis of all, with odometry as the trusted backbone, keeps.
     """
     ids, seeing = vertex_ids(source), clouds.sizes > 0
     range_m = median_range_m(clouds, np.flatnonzero(seeing))

@@ -15,11 +15,11 @@ FACTOR_OF_UNITS = 50.0
 SURFACE_NEIGHBOURS = 30
 SAMPLED_POINTS = 2000
 VOLUME = 0.12
-"""Share of the least variance of a neighbourhood: a third in a volume, some per cent on a surface."""
+"""Least share of variance in a neighbourhood of no surface: a third in a volume, a few per cent on a surface."""
 
 
 def check_scans(clouds: CloudSet, names: NDArray[np.generic]) -> tuple[str, ...]:
-    """One line for each scan that cannot be registered for what it is, or is a copy, or seems to have other units."""
+    """One line for each scan whose shape cannot be registered, that is a copy, or that seems to have other units."""
     notes = [*_units(clouds, names), *_copies(clouds, names)]
     for name, cloud in zip(names, clouds, strict=True):
         reason = unregistrable(cloud) if len(cloud) else ""

@@ -36,7 +36,7 @@ DESCRIBED, VIEWS = "described", "views"
 
 @dataclass(frozen=True)
 class Start:
-    """The first poses (N, 4, 4), pieces laid apart; the edges that they rest on; the piece (N,) of each frame."""
+    """The first poses (N, 4, 4), components laid out apart; the edges kept; the component `piece (N,)` of a frame."""
 
     world_from_cam: Floats
     edges: Edges
@@ -46,9 +46,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Frames:
-    """What is to be joined: frames, their clouds (a folder), and edges and poses that are known already, from odometry,
-    or none.
-    """
+    """The frames to join, the folder of their clouds, and the edges and drift of odometry, if there was one."""
 
     frames: Sequence[Frame]
     clouds: Path
@@ -58,9 +56,9 @@ class Frames:
 
 
 def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Workers, advance: Advance) -> Start:
-    """Poses of all frames that the evidence joins; `advance` counts frames, once described and once placed.
+    """Poses of all frames by global registration; `advance` counts frames twice, when described and when placed.
 
-    `scratch` is a folder for the descriptions. Frames that nothing joins are pieces of their own, and said.
+    Unconnected frames become components of their own and are reported. `scratch` is a folder for the descriptions.
     """
     clouds = CloudSet.open(scene.clouds)
     by_image = uses_images(clouds, options)
@@ -84,14 +82,14 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
 
 
 def _ambiguous_pairs(hypotheses: Edges, piece: Ints) -> tuple[Note, ...]:
-    """A note where pairs that fit in several ways would join pieces (N,)."""
+    """A note where ambiguous pairs would have joined components."""
     first, second = hypotheses.pairs[hypotheses.why == AMBIGUOUS].T
     count = int((piece[first] != piece[second]).sum())
     return (Note("ambiguous", count, str(len(hypotheses))),) if count else ()
 
 
 def _none_joined(scene: Frames, hypotheses: Edges, piece: Ints) -> tuple[Note, ...]:
-    """A note with what to do where no two frames are joined: to begin from their own poses, where all have one."""
+    """A note with what to do where no two frames are joined."""
     if scene.given is not None or len(np.unique(piece)) < max(len(scene.frames), 2):
         return ()
     if all(frame.world_from_cam is not None for frame in scene.frames):
@@ -103,7 +101,7 @@ def _none_joined(scene: Frames, hypotheses: Edges, piece: Ints) -> tuple[Note, .
 def weighed_matches(
     scene: Frames, rows: Ints, options: GlobalStart, scratch: Path, workers: Workers, advance: Advance
 ) -> tuple[Edges, Views]:
-    """The pairs of these rows that were matched, of which those count that may be edges; and the views of the frames.
+    """The matched pairs of these rows, with status used where they may be edges, and the depth views of the frames.
 
     `advance` counts frames as they are described into the folder `scratch`.
     """
@@ -148,7 +146,7 @@ def propose(scene: Frames, clouds: CloudSet, rows: Ints, described: Path, option
 
 
 def tried(count: int, hypotheses: Edges) -> str:
-    """How many pairs of so many frames were matched, and what became of them."""
+    """In words, how many pairs of `count` frames were matched, and what became of them."""
     every = count * (count - 1) // 2
     refused = ", ".join(f"{number} {reason}" for reason, number in hypotheses.rejected_counts.items())
     text = f"{len(hypotheses)} of {every} pairs were matched, {int(hypotheses.counts.sum())} may be edges"
@@ -156,7 +154,7 @@ def tried(count: int, hypotheses: Edges) -> str:
 
 
 class LocalDescriptors:
-    """Unit local descriptors of each row, whatever they were made of: RootSIFT, or the roots of FPFH histograms."""
+    """Unit local descriptors of each row: RootSIFT of images, or the square roots of FPFH histograms of clouds."""
 
     def __init__(self, described: Path, clouds: CloudSet, voxel_m: float) -> None:
         self._described, self._clouds, self._voxel_m = described, clouds, voxel_m

@@ -59,7 +59,7 @@ def _write_block(folder: Path, block: Sequence[tuple[int, Frame]]) -> int:
             continue
         try:
             view = depth_view(frame.read_depth(), frame.camera)
-        except (SourceError, OSError):  # said where the clouds are made
+        except (SourceError, OSError):  # reported where the clouds are made
             continue
         np.savez(folder / f"{row}.npz", nearest_m=view.nearest_m, stride=view.stride)
     return len(block)
