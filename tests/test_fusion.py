@@ -267,7 +267,9 @@ def test_a_frame_whose_image_is_damaged_is_fused_without_its_colour(fuser: TsdfF
     whole = fuser.fuse(frames, poses)
     damaged = partial(fail, SourceError("x.jpg: cut short"))
     frames[1] = Frame(1, 0.0, CAMERA, frames[1].read_depth, damaged)
-    model = fuser.fuse(frames, poses)
+    advances = list[int]()
+    model = fuser.fuse(frames, poses, advances.append)
+    assert sum(advances) == len(frames) and min(advances) >= 0
     assert model.notes == ("1 frame fused without colour: its image cannot be read (the first: 1: x.jpg: cut short)",)
     np.testing.assert_allclose(model.points_in_world, whole.points_in_world, atol=1e-6)  # in another order
     assert model.colours is not None

@@ -30,8 +30,8 @@ def constant_depth(metres: float) -> np.ndarray:
     return np.full((3, 4), metres, np.float32)
 
 
-def unreadable() -> np.ndarray:
-    raise SourceError("frame.png: is no PNG")
+def unreadable(error: type[Exception] = SourceError) -> np.ndarray:
+    raise error("frame.png: is no PNG")
 
 
 def walk(count: int) -> list[Frame]:
@@ -120,15 +120,17 @@ def test_a_wrong_depth_scale_is_suspected() -> None:
     assert oddities_of(near)[0].startswith("all depth lies within 0.4 m, as in a close-up: is the depth scale right")
 
 
-def test_frames_that_cannot_be_read_are_told() -> None:
+@pytest.mark.parametrize("error", [SourceError, OSError])
+def test_frames_that_cannot_be_read_are_told(error: type[Exception]) -> None:
     frames = walk(3)
-    frames[1] = replace(frames[1], read_depth=unreadable)
+    frames[1] = replace(frames[1], read_depth=partial(unreadable, error))
     facts = frame_facts(frames, [])
     assert facts["unreadable among them"] == ["frame.png: is no PNG"] and facts["frames looked into"] == 2
 
 
-def test_images_without_readable_colours_are_told() -> None:
-    frames = [replace(frame, read_colour=unreadable) for frame in walk(2)]
+@pytest.mark.parametrize("error", [SourceError, OSError])
+def test_images_without_readable_colours_are_told(error: type[Exception]) -> None:
+    frames = [replace(frame, read_colour=partial(unreadable, error)) for frame in walk(2)]
     facts = frame_facts(frames, [])
     assert facts["unreadable among them"] == ["frame.png: is no PNG"] * 2 and facts["frames looked into"] == 2
 

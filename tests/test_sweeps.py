@@ -21,6 +21,7 @@ from hodge_pipeline.demo.sweeps import FARTHEST_M, REVOLUTION_S, SpinningScanner
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.registration.clouds import CloudOptions
+from hodge_pipeline.registration.scan_to_map import ScanToMap
 from hodge_pipeline.registration.sweeps import deskewed, deskewed_frame
 from hodge_pipeline.sources.frame_facts import frame_facts
 from hodge_pipeline.stages import Step, Steps, no_progress
@@ -84,6 +85,16 @@ def test_sweeps_after_unread_ones_are_followed() -> None:
     rows = np.flatnonzero(found.found)
     assert absolute_error(found.world_from_scan[rows], true_poses(rows)).max_m < NEAR_M
     assert np.linalg.norm(found.velocity[rows, 3:], axis=1) == pytest.approx(SPEED_M_S, abs=0.5)
+
+
+def test_a_sweep_that_cannot_be_aligned_tells_nothing_of_how_far_the_scanner_went() -> None:
+    clouds = [cast(Callable[[], PointCloud], frame.read_points)() for frame in street()[:3]]
+    clouds.insert(2, PointCloud(clouds[2].points_in_cam[:3]))
+    tracker, loose = ScanToMap(0.5, np.zeros(6)), []
+    for number, cloud in enumerate(clouds):
+        tracker.follow(cloud, number * REVOLUTION_S)
+        loose.append(tracker.is_loose)
+    assert loose == [False, False, True, False]
 
 
 @pytest.mark.parametrize(

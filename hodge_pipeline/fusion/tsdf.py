@@ -148,7 +148,7 @@ class TsdfFuser:
         return np.array(sorted(blocks), np.int64).reshape(-1, 3), spans
 
     def _integrate(self, grid: BlockGrid, views: Views, skipped: Skipped, progress: _Progress) -> None:
-        views = list(views)
+        views, count = list(views), len(views)
         for row, (frame, pose, is_coloured) in enumerate(views):  # grows, see below
             if frame.camera is None or frame.read_depth is None:
                 skipped.add("no depth image", frame)
@@ -161,7 +161,7 @@ class TsdfFuser:
                 depth_m = frame.read_depth()
                 if not grid.integrate(depth_m, colour, frame.camera, pose):
                     skipped.add(f"no depth within max_depth_m = {self.max_depth_m:g}", frame)
-            progress.reached(row + 1)
+            progress.reached(min(row + 1, count))
 
     def _thinned(self, fused: int, frames: int) -> list[str]:
         if self.min_motion_m == 0 or fused == frames:

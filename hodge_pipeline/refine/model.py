@@ -136,6 +136,7 @@ def _refine(
     notes = (*model.notes, *found.notes, *(str(scale) for scale in scales))
     cost = found.costs[at]
     doubt = cost.doubt or cost.images_doubt or (_loose_doubt(start, model) if at and not is_metric else "")
+    doubt = ": ".join(filter(None, (final.doubt, doubt)))
     decision = replace(decision, measures=measures, change=change, doubt=doubt)
     kept = 0 if decision.keeps_input else at + len(candidates) - len(names)
     return RefinedModel(inputs, start, model, scales, final, tuple(candidates), kept, found.solved, decision, notes)

@@ -22,6 +22,9 @@ OF_MEDIAN = 1.2533
 LEAST_SIGMA = 1e-4
 
 
+NO_DEPTH = "there is no depth"
+
+
 @dataclass(frozen=True)
 class Scale:
     """Metres in one unit of a model, with its relative standard error; 1 and a reason where it cannot be told.
@@ -40,6 +43,11 @@ class Scale:
     def is_observable(self) -> bool:
         """Whether depth tells it."""
         return not self.reason
+
+    @property
+    def doubt(self) -> str:
+        """Why a model is not in metres though it has depth."""
+        return f"not in metres, since {self.reason}" if self.reason and self.reason != NO_DEPTH else ""
 
     @property
     def is_one(self) -> bool:
@@ -65,7 +73,7 @@ def metric_scale(ratios: Sequence[Floats]) -> Scale:
     useful = [one for one in ratios if len(one)]
     found = np.concatenate([np.zeros(0), *useful])
     if not len(ratios):
-        return _unknown(0, 0, "there is no depth")
+        return _unknown(0, 0, NO_DEPTH)
     if len(found) < LEAST_POINTS or len(useful) < LEAST_IMAGES:
         return _unknown(
             len(found), len(useful), f"depth at only {counted(len(found), 'point')} of {len(useful)} images"

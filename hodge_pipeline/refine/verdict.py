@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline import registry
+from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances
 from hodge_pipeline.evaluation.trajectory import absolute_error
@@ -18,6 +19,7 @@ from hodge_pipeline.refine.guard import Decision, Measure, decide
 from hodge_pipeline.refine.image_steps import MOST_STEPS, step_errors
 from hodge_pipeline.refine.uncertainty import change, mean_chi2
 from hodge_pipeline.rounds.one_round import Work
+from hodge_pipeline.rounds.settling import last_shift_m, settled_m
 from hodge_pipeline.scene import KeyFrames, Round
 from hodge_pipeline.sources.inspect import guesses
 from hodge_pipeline.stages import Step, Workers
@@ -81,7 +83,7 @@ def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
     moved = change(last.graph, replace(last.solution, world_from_cam=after), before)
     decision = decide(measures, moved, force=work.recipe.guard.force)
     if decision.outcome == "refined":  # by clouds, which a sensor may warp alike in every frame
-        measures += [*_images(work, key_frames, after), *_size(work, before, after)]
+        measures += [*_images(work, key_frames, after), *_size(work, before, after), *_settled(work, rounds)]
         decision = decide(measures, moved, force=work.recipe.guard.force)
     return decision, after
 
@@ -174,6 +176,19 @@ def _size(work: Work, before: Floats, after: Floats) -> list[Measure]:
         return []
     work.steps.note(Note("path scaled", detail=f"{factor:.3g}"))
     return [Measure("change of the path's size", 0.0, abs(factor - 1), tolerance=LARGEST_SIZE)]
+
+
+def _settled(work: Work, rounds: Sequence[Round]) -> list[Measure]:
+    """How far the last round still moved the poses, beside what it may; empty where they have settled."""
+    last = rounds[-1]
+    component = connected_components(last.graph.edges, last.graph.vertex_count)
+    shift_m, limit_m = (
+        last_shift_m(rounds, component),
+        settled_m(last.world_from_cam[:, :3, 3], float(work.recipe.scale)),
+    )
+    if shift_m is None or shift_m <= limit_m:
+        return []
+    return [Measure("movement in the last round, and what it may be", limit_m, shift_m, unit="m")]
 
 
 def first_as_good(scores: Floats) -> int:

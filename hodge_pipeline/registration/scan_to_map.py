@@ -45,7 +45,7 @@ MOST_DESKEWS, FARTHER = 3, 0.9
 
 class ScanToMap:
     """Scan to map on one sequence: `pose` is that at the middle of the last sweep, which took `turn_s` (0: unknown);
-    `is_loose`: the last alignment hardly constrained translation in some direction.
+    `is_loose`: the last alignment hardly constrained translation in some direction, or failed.
 
     Sweeps are deskewed to their middle, about which the error of a wrong velocity is symmetric: deskewed to their first
     points, it would move the next pose the other way by half, and the velocity would oscillate.
@@ -72,6 +72,7 @@ class ScanToMap:
             if self._shift_m(velocity, points, abs(duration)) > self._coarsest_m:
                 guesses.append(before)  # after a gap the scanner may be where it was
             self.pose, information = self._map.align(points, guesses)
+            self.is_loose = information is None and self._time_s is not None
             if information is None or not duration:  # no velocity from two sweeps of one stamp
                 break
             known = np.linalg.eigvalsh(information[3:, 3:])

@@ -32,6 +32,7 @@ from hodge_pipeline.report.photographs import changed_most, four_sides, worst_pa
 from hodge_pipeline.report.refined import summary
 from hodge_pipeline.report.summary import graph_summary, trajectory_rows, unheld, weigh_wrong, worst_edges
 from hodge_pipeline.report.write import write_report
+from hodge_pipeline.rounds.settling import last_shift_m
 from hodge_pipeline.scene import (
     START,
     GivenFile,
@@ -135,7 +136,7 @@ def make_report(
         notes=(*store.notes, *(() if scans else unheld(last.edges, last.vertex_ids, recipe.acceptance.min_spread))),
         versions=versions(),
         recipe=yaml_file.dump(binding.unbind(recipe)),
-        last_shift_m=_last_shift(rounds, component),
+        last_shift_m=last_shift_m(rounds, component),
         wrong_edges=store.step(weigh_wrong, last, recipe.solver, title="edges judged wrong"),
         unmeasured=_unmeasured(recipe, scores, last),
         position_fit=last.position_fit,
@@ -157,16 +158,6 @@ def _unmeasured(recipe: Recipe, scores: ScoreTable | None, last: Round) -> str:
     if not recipe.evaluation.tables:
         return "the recipe asks for no scores (evaluation.tables is false), and there are no true poses."
     return "scores are not measured after an edit, and there are no true poses." if last.edited else ""
-
-
-def _last_shift(rounds: Sequence[Round], component: Ints) -> float | None:
-    """How far the last round moved the positions (root mean square, aligned); None where it is the first to solve, or
-    that of edits, which are meant to move them.
-    """
-    if len(rounds) < 3 or rounds[-1].edited:
-        return None
-    shift_m = absolute_error(rounds[-2].world_from_cam, rounds[-1].world_from_cam, component).rmse_m
-    return float(shift_m) if np.isfinite(shift_m) else None
 
 
 def _trajectories(

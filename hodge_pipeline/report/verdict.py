@@ -12,7 +12,7 @@ from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M
 from hodge_pipeline.evaluation.difference import MEASURABLE, Change, floor_of, length
 from hodge_pipeline.report import known_positions
 from hodge_pipeline.report.contents import GraphSummary, Report, TrajectoryRow
-from hodge_pipeline.types import Floats
+from hodge_pipeline.rounds.settling import settled_m
 from hodge_pipeline.types.notes import Note
 
 Outcome: TypeAlias = Literal["improved", "unchanged", "worse", "mixed", "not measured"]
@@ -20,9 +20,6 @@ Outcome: TypeAlias = Literal["improved", "unchanged", "worse", "mixed", "not mea
 LARGE_RESIDUAL_M = 0.1
 LARGE_RESIDUAL_DEG = 5.0
 UNMATCHED_SHARE = 0.01
-UNSETTLED_M, UNSETTLED_SHARE = 0.05, 0.01
-"""By how much (root mean square), and by which share of the path, the last of several rounds may move the positions.
-Runs that end near the truth move by less than 1 cm, one whose edges slide along a bare floor by 30."""
 OTHER_SCALE, EXPLAINED = 1.1, 0.25
 """The factor between the true path and the result from which one is not in metres, if scaling by it leaves less than a
 quarter of the error: focal lengths are known to a few per cent, and units differ by 5 or 1000.
@@ -52,6 +49,9 @@ REASONS = {
     "path scaled": "the path is of another size than the one given",
     "depth unit": "depth is probably not in metres",
     "focal length": "images contradict the camera's focal length",
+    "millimetres": "its unit looks like the millimetre",
+    "left apart": "a guess joins what tracking left apart",
+    "wrong": "edges that it uses are judged wrong",
 }
 """By kind of note, what a headline begins with (`DOUBTS`; lost frames from `MOSTLY_LOST` on), and the reasons of `in
 doubt, since …` (`REASONS`), whatever the measures say."""
@@ -105,7 +105,9 @@ def judge(report: Report) -> Verdict:
     if pieces:
         all_joined = report.source.unordered and len(report.pieces) == 1 and outcome in ("improved", "unchanged")
         headline = pieces if all_joined else f"{pieces}: {headline[:1].lower()}{headline[1:]}"
-    told = sorted((*_unsettled(report), *_other_scale(report), *report.notes), key=lambda note: note.rank)
+    told = sorted(
+        (*_unsettled(report), *_other_scale(report), *report.notes, *_wrong(report)), key=lambda note: note.rank
+    )
     reasons = " and ".join(REASONS[note.kind] for note in told if note.kind in REASONS)
     frames = report.source.frames
     doubts = [
@@ -225,10 +227,8 @@ def suspicions(report: Report) -> tuple[Note, ...]:
 
 
 def _unsettled(report: Report) -> Iterator[Note]:
-    path_m = max((_path_m(path.positions) for path in report.pictures.paths if path.name == report.after), default=0.0)
-    if report.last_shift_m is not None and report.last_shift_m > max(
-        UNSETTLED_M * report.scale, UNSETTLED_SHARE * path_m
-    ):
+    after = [path.positions for path in report.pictures.paths if path.name == report.after] or [np.zeros((0, 3))]
+    if report.last_shift_m is not None and report.last_shift_m > settled_m(after[0], report.scale):
         yield Note("unsettled", detail=length(report.last_shift_m))
 
 
@@ -248,10 +248,6 @@ def _other_scale(report: Report) -> Iterator[Note]:
     explained = np.sum((scale * x - y) ** 2) < EXPLAINED**2 * np.sum((x - y) ** 2)
     if explained and (scale > OTHER_SCALE or 0 < scale < 1 / OTHER_SCALE):
         yield Note("other scale", detail=f"{float(f'{scale:.2g}'):g}")
-
-
-def _path_m(positions: Floats) -> float:
-    return float(np.nansum(np.linalg.norm(np.diff(positions, axis=0), axis=1)))
 
 
 def _graph_suspicions(graph: GraphSummary) -> Iterator[Note]:

@@ -167,7 +167,7 @@ def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]
         frame = with_depth[row]
         try:
             depths.append(_depth(frame).ravel())
-        except SourceError as error:
+        except (SourceError, OSError) as error:
             faults.append(str(error))
             continue
         faults += _colour_fault(frame)
@@ -202,7 +202,7 @@ def _colour_fault(frame: Frame) -> list[str]:
     try:
         if frame.read_colour is not None:
             frame.read_colour()
-    except SourceError as error:
+    except (SourceError, OSError) as error:
         return [str(error)]
     return []
 

@@ -293,7 +293,7 @@ def register_steps(
     held = edges.fitness >= options.min_fitness
     if not held.all():
         breaks = int((~held).sum())
-        step.note(Note("path broken", breaks, str(breaks)))
+        step.note(Note("path broken", breaks, str(breaks + 1)))
     edges = replace(edges, i_from_j=guesses)
     space_m = REACHES_APART * clouds.reach_m
     poses = chained(len(world_from_key), sequences, edges, space_m)

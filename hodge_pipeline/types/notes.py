@@ -78,7 +78,7 @@ LOOKS = {
     "objects that move? The camera's motion is the one that fits more of the image; key frames leave out what moves",
     "clock": "the clock goes back at {detail}: the step there counts as long as the usual one",
     "holes": "the recording stops for {detail}: what the frames on both sides share tells the motion there",
-    "path broken": "tracking was lost for good in {count} {count:place|places}: {detail} pieces of the path begin anew",
+    "path broken": "tracking was lost for good in {count} {count:place|places}: the path is in {detail} pieces",
     "slid": "odometry slid unnoticed at {count} {count:frame|frames} ({detail}): the pairs over these steps agree on "
     "where they lead, and count in its place",
     "sweeps left out": "{count} {count:sweep is|sweeps are} left out, and posed by neighbours where these are known; "

@@ -108,18 +108,22 @@ def depth_ratios(
 ) -> Sequence[Floats]:
     """Metres by the sensor over units by the model at the observations of each image (by row), of `MOST_IMAGES` evenly.
 
-    `camera`: fx fy cx cy of the depth images; none where their pixels are those of the colour images.
+    `camera`: fx fy cx cy of the depth images; none where their pixels are those of the colour images. Raises
+    `SourceError` where none of them can be read.
     """
     rows = np.array(sorted(sensors), np.int64)
     if len(rows) > MOST_IMAGES:
         rows = rows[np.linspace(0, len(rows) - 1, MOST_IMAGES).round().astype(int)]
-    ratios = []
+    ratios, faults = [], list[SourceError]()
     for row in rows.tolist():
         try:
             depth = pixels.read_depth(sensors[row], units_per_metre=units_per_metre, no_depth=no_depth)
-        except SourceError:
-            continue  # the frame itself reports it when it is read
+        except SourceError as fault:  # the frame itself reports it when it is read
+            faults.append(fault)
+            continue
         ratios.append(_ratios(model, row, depth, camera))
+    if faults and not ratios:
+        raise faults[0]
     return ratios
 
 
