@@ -311,6 +311,10 @@ class TrackedModel(Protocol):
         """The same model, whose adjustments let an observation that is far off pull little."""
         ...
 
+    def with_free_focal_lengths(self) -> TrackedModel:
+        """The same model, whose adjustments refine focal lengths."""
+        ...
+
     @property
     def moves_intrinsics(self) -> bool:
         """Whether that adjusts the cameras' intrinsics too."""

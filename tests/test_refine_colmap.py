@@ -3,13 +3,16 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
 from typer.testing import CliRunner
 
 import hodge_pipeline
+from hodge_adapters.colmap.content import read_model
 from hodge_adapters.colmap.models import ColmapModels
+from hodge_adapters.colmap.scale import depth_ratios
 from hodge_adapters.colmap.tracked import ColmapModel
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
@@ -303,7 +306,8 @@ def test_a_refinement_that_was_stopped_goes_on_and_ends_the_same(
     with monkeypatch.context() as patch:
         calls = counted(patch, "adjusted")
         hodge_pipeline.refine_colmap(start, overrides=FREE, out=out)
-        assert len(calls) == 1, "that of the model as given was done before"
+        held = [model for model in calls if isinstance(model, ColmapModel) and model.refine == "none"]
+        assert len(held) == 1, "that of the model as given was done before"
     monkeypatch.setattr(ColmapModel, "adjusted", refuse)
     again = hodge_pipeline.refine_colmap(start, overrides=FREE, out=out)
     assert again.results[0].decision.outcome == "refined"
@@ -354,6 +358,16 @@ def test_points_that_one_image_saw_are_kept(tmp_path: Path) -> None:
     done = hodge_pipeline.refine_colmap(odd, database="none", overrides=FREE)
     assert done.results[0].decision.outcome == "refined"
     assert done.models[0].points3D[lone].track.length() == 1
+
+
+def test_depth_that_tells_no_scale_is_a_doubt_and_depth_that_cannot_be_read_an_error(tmp_path: Path) -> None:
+    assert metric_scale([]).doubt == "" and metric_scale([np.full(60, 2.0)] * 3).doubt == ""
+    assert metric_scale([np.zeros(0)] * 3).doubt == "not in metres, since depth at only 0 points of 0 images"
+    file = tmp_path / "0.png"
+    cv2.imwrite(str(file), np.full((4, 4), 9, np.uint8))
+    synthetic(tmp_path)
+    with pytest.raises(SourceError, match="0.png: depth must be uint16"):
+        depth_ratios(read_model(tmp_path / "binary")[1], {0: file}, 1000.0, (0,))
 
 
 def test_scale_is_the_median_with_the_error_of_the_images_medians() -> None:
@@ -407,5 +421,8 @@ def test_intrinsics_are_held_unless_they_are_to_be_refined(tmp_path: Path, refin
         assert abs(params[0] / focal - 1) < 5e-3 if refine != "none" else params[0] == before[0]
         assert (params[1] == before[1]) == (refine != "all") and (params[3] == before[3]) == (refine != "all")
     notes = " ".join(result.notes)
+    assert ("contradict the intrinsics (focal lengths of 2 cameras changed by" in result.decision.doubt) == (
+        refine == "none"
+    )
     assert ("intrinsics are held: --refine" in notes) == (refine == "none")
     assert ("focal lengths of 2 cameras changed by" in notes) == (refine != "none")

@@ -1,11 +1,14 @@
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
+from hodge_pipeline.refine import verdict
 from hodge_pipeline.refine.guard import Change, Measure, decide
 from hodge_pipeline.refine.verdict import chi2_measure, first_as_good, spread_corrections
 from hodge_pipeline.scene import KeyFrames
@@ -54,6 +57,21 @@ def test_poses_that_held_out_measurements_fit_as_well_or_better_are_given_back_w
     assert decide([replace(held_out, after=0.91)], MOVED).outcome == "refined", "fewer pairs tell less"
     failed = replace(BETTER, after=0.02)
     assert decide([held_out, failed], MOVED).outcome == "worse"
+
+
+@pytest.mark.parametrize(("shift_m", "settled"), [(0.04, True), (0.2, False)])
+def test_poses_that_the_last_round_still_moved_are_worse(shift_m: float, settled: bool):
+    """A bend of a straight path of 3 m, which no alignment takes away."""
+    work = SimpleNamespace(recipe=SimpleNamespace(scale=1.0))
+    graph = SimpleNamespace(edges=np.array([[0, 1], [1, 2], [2, 3]]), vertex_count=4)
+    rounds = []
+    for bend_m in (0.0, 0.0, 2 * shift_m):
+        positions = np.outer(np.arange(4.0), [1.0, 0, 0]) + np.outer([1, -1, -1, 1], [0, bend_m, 0]) / 2
+        poses = se3.from_parts(np.broadcast_to(np.eye(3), (4, 3, 3)), positions)
+        rounds.append(SimpleNamespace(world_from_cam=poses, graph=graph, edited=False))
+    measures = verdict._settled(work, rounds)
+    assert (not measures) == settled
+    assert decide([BETTER, *measures], MOVED).outcome == ("refined" if settled else "worse")
 
 
 def key_frames(count: int) -> tuple[KeyFrames, np.ndarray]:

@@ -13,6 +13,7 @@ from hodge_pipeline.evaluation.trajectory import align
 from hodge_pipeline.executors.dask import open_workers
 from hodge_pipeline.refine.candidates import GIVEN, Found, weigh
 from hodge_pipeline.refine.choice import Choice, choose, held_out_score
+from hodge_pipeline.refine.focal import focal_doubt
 from hodge_pipeline.refine.guard import Change, Decision, Measure
 from hodge_pipeline.refine.judge import SAME_COST, Cost, named
 from hodge_pipeline.refine.model_edges import held_out_distances
@@ -135,7 +136,8 @@ def _refine(
     candidates = names if len(inputs) == 1 else [(f"{len(inputs)} models apart", found.inputs), *names]
     notes = (*model.notes, *found.notes, *(str(scale) for scale in scales))
     cost = found.costs[at]
-    doubt = cost.doubt or cost.images_doubt or (_loose_doubt(start, model) if at and not is_metric else "")
+    doubt = focal_doubt(chosen, steps) or cost.doubt or cost.images_doubt
+    doubt = doubt or (_loose_doubt(start, model) if at and not is_metric else "")
     doubt = ": ".join(filter(None, (final.doubt, doubt)))
     decision = replace(decision, measures=measures, change=change, doubt=doubt)
     kept = 0 if decision.keeps_input else at + len(candidates) - len(names)

@@ -279,6 +279,10 @@ class ColmapModel:
         """The same model, whose adjustments let an observation that is far off pull little."""
         return replace(self, robust=True)
 
+    def with_free_focal_lengths(self) -> ColmapModel:
+        """The same model, whose adjustments refine focal lengths."""
+        return replace(self, refine="focal")
+
     @property
     def moves_intrinsics(self) -> bool:
         """Whether bundle adjustment changes more than poses and points."""
