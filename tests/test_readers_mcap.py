@@ -244,12 +244,22 @@ def test_calibrations_that_do_not_fit(tmp_path: Path) -> None:
         McapReader().open(log.write(tmp_path / "none.mcap"))
     by_option = check_reader(McapReader(camera=(9, 9, 4, 3)), tmp_path / "none.mcap")
     assert by_option.frames[0].camera == Camera(WIDTH, HEIGHT, 9, 9, 4, 3)
-    log.add(INFO, CALIBRATION, {**foxglove_header(100, OPTICAL), **calibration(640, 480, 500, 500, 320, 240)}, CDR)
-    with pytest.raises(SourceError, match="no calibration"):
+    half = calibration(2 * WIDTH, 2 * HEIGHT, 20, 20, 8.5, 6.5)
+    log.add(INFO, CALIBRATION, {**foxglove_header(100, OPTICAL), **half}, CDR)
+    scaled = McapReader().open(log.write(tmp_path / "half.mcap"))
+    assert scaled.frames[0].camera == Camera(WIDTH, HEIGHT, 10, 10, 4, 3)
+    assert f"{INFO}: intrinsics of {2 * WIDTH}x{2 * HEIGHT} are scaled to the images' {WIDTH}x{HEIGHT}" in scaled.notes
+
+
+def test_calibrations_of_another_shape_are_named(tmp_path: Path) -> None:
+    log = Log()
+    log.add(DEPTH, RAW, {**foxglove_header(100, OPTICAL), **some_images(1)[0]}, CDR)
+    log.add(INFO, CALIBRATION, {**foxglove_header(100, OPTICAL), **calibration(640, 400, 500, 500, 320, 200)}, CDR)
+    with pytest.raises(SourceError, match=f"no calibration .*8x6 images of {DEPTH}: there is {INFO} 640x400: give"):
         McapReader().open(log.write(tmp_path / "size.mcap"))
     with pytest.raises(
         SourceError,
-        match="calibrates 640x480 images, those of /cam/depth/image are 8x6: give --set source.reader.camera=",
+        match="calibrates 640x400 images, those of /cam/depth/image are 8x6: give --set source.reader.camera=",
     ):
         McapReader(calibration_topic=INFO).open(tmp_path / "size.mcap")
 

@@ -137,9 +137,11 @@ class McapReader:
         named = named_topic(depth, self.depth_topic, "depth_topic")[0] if self.depth_topic else ""
         topic = named or best_depth(depth, colour, notes)
         images = one_per_stamp(topic, depth[topic], notes)
+        before = len(notes)
         camera = self._camera(recording, topic, images[0], notes)
         if camera is None:
-            why = "".join(f"; {note}" for note in recording.complaints.counted(A_MESSAGE_WITH + NO_PINHOLE))
+            reasons = [*notes[before:], *recording.complaints.counted(A_MESSAGE_WITH + NO_PINHOLE)]
+            why = "".join(f"; {note}" for note in reasons)
             raise SourceError(f"{path}: no calibration for {topic}{why}: give --set source.reader.camera=[fx,fy,cx,cy]")
         if self.colour_topic:
             colour = dict([named_topic(colour, self.colour_topic, "colour_topic")])

@@ -11,7 +11,8 @@ from typing import TypeVar
 import numpy as np
 
 from hodge_adapters.association import clock_runs
-from hodge_adapters.images.camera_files import principal_point_note
+from hodge_adapters.images.camera_files import principal_point_note, resized
+from hodge_adapters.images.pixels import same_shape
 from hodge_adapters.mcap.images import ImageLayout
 from hodge_adapters.mcap.recording import Calibration, Recording, Seen
 from hodge_adapters.text_rows import listed
@@ -100,7 +101,9 @@ def best_colour(colour: ImageTopics, depth_topic: str, first: Seen[ImageLayout],
 def find_camera(
     recording: Recording, topic: str, image: Seen[ImageLayout], calibration_topic: str, notes: list[str]
 ) -> Camera | None:
-    """The camera of an image topic by its calibration; None, with notes, where none fits."""
+    """The camera of an image topic by its calibration; None, with notes, where none fits. One of another size is scaled
+    where the shape is the same and its topic lies beside that of the images.
+    """
     known = recording.calibrations
     if calibration_topic:
         chosen, calibration = named_topic(known, calibration_topic, "calibration_topic")
@@ -108,11 +111,18 @@ def find_camera(
     for name in sorted(known):
         if known[name].model.lower() not in _PINHOLE_MODELS:
             notes.append(f"{name}: calibration left out: its model {known[name].model!r} is no pinhole camera")
-    size = image.layout.size
+
+    def is_beside(name: str) -> bool:
+        return name.rpartition("/")[0] == image_base(topic).rpartition("/")[0]
+
+    def fits(name: str, size: tuple[int, int]) -> bool:
+        same = size in (image.layout.size, (0, 0))
+        return same or (is_beside(name) and same_shape(size, image.layout.size))
+
     fitting = {
         name: calibration
         for name, calibration in known.items()
-        if calibration.model.lower() in _PINHOLE_MODELS and (calibration.width, calibration.height) in (size, (0, 0))
+        if calibration.model.lower() in _PINHOLE_MODELS and fits(name, (calibration.width, calibration.height))
     }
     if not fitting:
         if known:
@@ -121,8 +131,7 @@ def find_camera(
         return None
 
     def rank(name: str) -> tuple[bool, bool, int, str]:
-        beside = name.rpartition("/")[0] == image_base(topic).rpartition("/")[0]
-        return not beside, fitting[name].frame_id != image.frame_id, -len(_common_start(name, topic)), name
+        return not is_beside(name), fitting[name].frame_id != image.frame_id, -len(_common_start(name, topic)), name
 
     chosen = min(fitting, key=rank)
     return _camera(chosen, fitting[chosen], topic, image.layout, notes)
@@ -137,13 +146,15 @@ def _camera(name: str, calibration: Calibration, topic: str, layout: ImageLayout
     p, k = calibration.p, calibration.k
     is_rectified = "rect" in image_base(topic).rpartition("/")[2] and bool(p) and p[0] > 0 and p[5] != 0
     fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if is_rectified else (k[0], k[4], k[2], k[5])
-    size = f"{calibration.width}x{calibration.height}"
-    if (calibration.width, calibration.height) not in (layout.size, (0, 0)):
+    size = calibration.width or layout.width, calibration.height or layout.height
+    if not same_shape(size, layout.size):
         raise SourceError(
-            f"{name}: calibrates {size} images, those of {topic} are {_size(layout)}: "
+            f"{name}: calibrates {size[0]}x{size[1]} images, those of {topic} are {_size(layout)}: "
             "give --set source.reader.camera=[fx,fy,cx,cy]"
         )
-    camera = Camera(layout.width, layout.height, fx, fy, cx, cy)
+    camera = resized(Camera(*size, fx, fy, cx, cy), layout.size)
+    if size != layout.size:
+        notes.append(f"{name}: intrinsics of {size[0]}x{size[1]} are scaled to the images' {_size(layout)}")
     notes.append(f"{topic}: intrinsics from {name}{' (rectified: P)' if is_rectified else ''}")
     if calibration.is_distorted and not is_rectified:
         notes.append(f"{name}: has lens distortion, which is not corrected: images are taken as undistorted")
