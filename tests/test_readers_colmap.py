@@ -362,3 +362,12 @@ def test_whatever_the_bytes_are_pycolmap_neither_crashes_nor_hangs(tmp_path: Pat
     assert done.returncode == 0, done.stderr[-2000:]
     opened, refused = map(int, done.stdout.split())
     assert opened >= 10 and refused >= 10
+
+
+def test_text_files_beside_a_binary_model_are_noted(tmp_path: Path) -> None:
+    synthetic(tmp_path)
+    note = "the binary model is read, not the text files beside it"
+    assert note not in ColmapReader(edges="none").open(tmp_path / "binary").notes
+    for file in (tmp_path / "text").iterdir():
+        shutil.copy(file, tmp_path / "binary")
+    assert note in ColmapReader(edges="none").open(tmp_path / "binary").notes

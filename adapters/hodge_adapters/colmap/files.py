@@ -47,10 +47,17 @@ def no_model(path: Path) -> SourceError:
 
 def model_ending(folder: Path) -> str | None:
     """`.bin` or `.txt` where the folder holds a model; COLMAP itself prefers the binary one."""
-    for ending in (".bin", ".txt"):
-        if all((folder / f"{name}{ending}").is_file() for name in ("cameras", "images")):
-            return ending
-    return None
+    return next(iter(_endings(folder)), None)
+
+
+def unread_text(folder: Path) -> tuple[str, ...]:
+    """A note where a model lies there as text as well, which may be another one."""
+    return ("the binary model is read, not the text files beside it",) if len(_endings(folder)) > 1 else ()
+
+
+def _endings(folder: Path) -> list[str]:
+    names = "cameras", "images"
+    return [ending for ending in (".bin", ".txt") if all((folder / f"{name}{ending}").is_file() for name in names)]
 
 
 def find_folder(model: Path, given: str, usual: Sequence[str]) -> Path | None:

@@ -34,6 +34,7 @@ from hodge_adapters.colmap.files import (
     largest_model,
     no_model,
     part_of_model,
+    unread_text,
 )
 from hodge_adapters.colmap.records import CameraRecord, ImageRecord, Model
 from hodge_adapters.colmap.scale import metres_per_unit, scaled_graph, scaled_poses
@@ -122,7 +123,7 @@ class ColmapReader:
 
     def source_of(self, path: Path, folder: Path, model: Model) -> Source:
         """The source that a model of this folder is, with what lies beside it; `path` is what the user gave."""
-        notes = list(model.notes)
+        notes = [*unread_text(folder), *model.notes]
         colour_folder = find_images(folder, self.images)
         if self.images == "auto":
             notes += by_report(folder, colour_folder)
