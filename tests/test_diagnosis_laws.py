@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from benchmarks.edge_scores import area_under_roc
 from diagnosis_graphs import SIGMA, every_pair_tried, measured, near_pairs, poses_on_a_ring, spoiled
 from hodge_pipeline import se3
-from hodge_pipeline.complex.judging import chi2_by_information, left_over, mean_variances, squares_at_both_ends
+from hodge_pipeline.complex.judging import chi2_by_information, mean_variances, residual_twists, squares_at_both_ends
 from hodge_pipeline.complex.short_cycles import short_cycles
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
@@ -106,7 +106,7 @@ def test_the_chi2_of_an_edge_is_the_same_written_the_other_way_round() -> None:
     np.testing.assert_allclose(chi2_by_information(turned, poses), chi2_by_information(graph, poses), rtol=1e-8)
     for one, other in zip(mean_variances(turned, False), mean_variances(graph, False), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6)
-    squares = [squares_at_both_ends(each.i_from_j, left_over(each, poses)) for each in (graph, turned)]
+    squares = [squares_at_both_ends(each.i_from_j, residual_twists(each, poses)) for each in (graph, turned)]
     np.testing.assert_allclose(squares[0], squares[1], rtol=1e-8, atol=1e-15)
 
 

@@ -1,4 +1,4 @@
-"""How well cycles close: what the motions along each leave over, and whether chance would let them close so well."""
+"""Closing errors of cycles, and whether they close better than by chance."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from hodge_pipeline.complex.short_cycles import short_cycles
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 AT_MIDDLE = 4
-"""Frames of a cycle, the first ones, whose middle is where its displacement is measured."""
+"""Number of first frames of a cycle at whose centre its displacement is measured."""
 LEVEL = 0.01
-"""Choices of edges that agree so well by chance, expected among all: as the gate of the edges, which 1 % miss."""
+"""Expected number of choices of edges, among all, that close so well by chance: as the 1 % gate of edges."""
 UNIFORM_RAD2 = (8 * math.pi**2) ** (2 / 3) / (2 * math.pi)
 """Variance of an axis at which a Gaussian is as dense at 0 as uniform rotations, which spread no wider."""
 FLAT = 100.0
-"""Times as large as usual along the axis that moves most are squares of motions along one that holds noise alone."""
+"""Ratio of the median squares of motions, to that of the largest axis, below which an axis holds noise alone."""
 FAR = 1e6
-"""Squared distance of an aim, in the variances of a walk, from which on that walk is no evidence."""
+"""Squared distance of an aim, in variances of a walk, beyond which the walk is no evidence."""
 LEAST_VARIANCE = 1e-200
-"""Of a walk of edges that do not move, so that what is divided by it stays finite."""
+"""Least variance of a walk, of edges that do not move, to divide by."""
 TRIANGLES_PER_EDGE = 8
-"""Of which all but the first that holds an edge are the same evidence again."""
+"""Most triangles listed per edge: all but the first over an edge repeat its evidence."""
 
 
 def cycle_errors(loops: Loops, i_from_j: Floats) -> tuple[Floats, Floats]:
-    """The angle (L,) in radians and the displacement (L,) in metres that the product of motions along each cycle
-    leaves, the latter at the middle of the cycle's frames.
+    """The closing error of each cycle: angle (L,), radians, and displacement (L,) at the centre of its first frames,
+    metres.
     """
     return errors_of_products(loop_products(loops, i_from_j), loops, i_from_j)
 
 
 def errors_of_products(products: Floats, loops: Loops, i_from_j: Floats) -> tuple[Floats, Floats]:
-    """The same where the products (L, 4, 4) are known."""
+    """`cycle_errors` of cycles whose products of motions (L, 4, 4) are given."""
     middle = _middles(loops, i_from_j)
     displacement_m = np.einsum("lij,lj->li", products[:, :3, :3], middle) + products[:, :3, 3] - middle
     return np.linalg.norm(se3.so3_log(products[:, :3, :3]), axis=1), np.linalg.norm(displacement_m, axis=1)

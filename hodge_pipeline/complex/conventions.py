@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.cycles import edge_between, root_from_vertex, spanning_forest
-from hodge_pipeline.complex.judging import left_over
+from hodge_pipeline.complex.judging import residual_twists
 from hodge_pipeline.types import Ints, ViewGraph
 
 NEARER = 4.0
@@ -54,4 +54,4 @@ def nearest_tree(edges: Ints, vertex_count: int) -> Ints:
 def _median_miss_m(graph: ViewGraph, tree: Ints, cycles: Ints) -> float:
     """How far the other edges are from the poses that those of the tree lead to."""
     poses = root_from_vertex(spanning_forest(graph.edges[tree], graph.vertex_count), graph.i_from_j[tree])
-    return float(np.median(np.linalg.norm(left_over(graph.select(cycles), poses)[:, 3:], axis=1)))
+    return float(np.median(np.linalg.norm(residual_twists(graph.select(cycles), poses)[:, 3:], axis=1)))

@@ -17,7 +17,7 @@ from scipy.linalg import eigh
 from scipy.sparse import coo_matrix, csr_matrix, kron
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.judging import left_over
+from hodge_pipeline.complex.judging import residual_twists
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 MOST_PIECES = 96
@@ -168,7 +168,7 @@ class Bending:
         carried = se3.adjoint(se3.inverse(poses[j]))
         weighed = np.swapaxes(carried, 1, 2) @ graph.information
         block = weighed @ carried
-        force = np.einsum("eij,ej->ei", weighed, left_over(graph, poses))
+        force = np.einsum("eij,ej->ei", weighed, residual_twists(graph, poses))
         total = np.zeros((len(poses), 6))
         np.add.at(total, j, force)
         np.add.at(total, i, -force)
