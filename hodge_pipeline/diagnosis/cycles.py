@@ -68,7 +68,7 @@ def usual_share(cycles: Cycles) -> float:
 
 
 def closing_support(cycles: Cycles, prior: Floats) -> Floats:
-    """How many cycles (E,) close over each edge, each weighed by how likely its other edges are."""
+    """How many cycles (E,) close over each edge, each weighted by the prior of its other edges."""
     strength = np.maximum(0.0, 1 - cycles.chi2 / CLOSES_BELOW)
     return cycles.loops.sums_at_edges(strength * np.exp(cycles.loops.sums(np.log(prior))), len(prior)) / prior
 

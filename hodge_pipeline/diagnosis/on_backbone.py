@@ -118,13 +118,13 @@ def _reasons(
         elif backbone.used[edge]:
             lines.append(f"it agrees with the backbone and {others - 1} other loops: {away}")
         elif name == UNTESTABLE and edges[edge, 0] == edges[edge, 1]:
-            lines.append("it joins a vertex to itself: it says nothing of the others")
+            lines.append("it joins a vertex to itself and constrains no other")
         elif name == UNTESTABLE:
             lines.append("it joins two paths of the backbone that nothing else joins: nothing can test it")
         elif not others:
             lines.append(f"nothing confirms it, nor any other loop: {away}, which are the backbone's")
         else:
-            fails = "it contradicts" if name == WRONG else "too little speaks for it beside"
+            fails = "it contradicts" if name == WRONG else "the evidence for it is too weak beside"
             lines.append(f"{fails} the backbone and {others} confirmed loops: {away}")
     return tuple(lines)
 

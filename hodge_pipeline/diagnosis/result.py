@@ -67,8 +67,8 @@ class Diagnosis:
         world_from_cam: Floats,
         tested: str,
     ) -> Diagnosis:
-        """The diagnosis of these verdicts: its pieces are those of the kept edges; `reasons` of the residuals (E,) in
-        metres and degrees; `tested`: a note on what tested the edges.
+        """The diagnosis with these verdicts, whose pieces are those of the kept edges; `reasons` makes the lines from
+        residuals (E,), metres and degrees; `tested`: a note on what tested the edges.
         """
         piece = network.component
         apart = piece[graph.edges[:, 0]] != piece[graph.edges[:, 1]]

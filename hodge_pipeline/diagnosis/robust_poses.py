@@ -89,8 +89,8 @@ def _solve(
     widened: float,
     initial: InitialName,
 ) -> tuple[Floats, Floats]:
-    """The poses (V, 4, 4) that the used edges (E,) lead to, weighed by Student's t, at first for χ² of `squares (E,)`;
-    and the χ² (E,) by the noise of the edges alone.
+    """The poses (V, 4, 4) of the used edges (E,), reweighted by Student's t, at first for χ² `squares (E,)`; and the χ²
+    (E,) by the noise of the edges alone, divided by `widened`.
 
     `widened`: how much larger than noise squared errors may be.
     """

@@ -93,7 +93,7 @@ def _against(is_bridge: bool, away: str) -> str:
     """Evidence against an edge none of whose cycles fails."""
     if is_bridge:
         return "it alone holds two parts together, which edges that were left out would join otherwise"
-    return f"against it speaks where all kept edges together lay its ends: {away}"
+    return f"all kept edges together place its ends elsewhere: {away}"
 
 
 def _undecided(graph: ViewGraph, cycles: Cycles, row: int, doubted: Bools) -> str:

@@ -72,7 +72,7 @@ def infer_bridged(
         if better is None:
             break
         chain, found = better
-    # a break that unconfirmed loops speak of is not confirmed either
+    # a break found by unconfirmed loops is not confirmed either
     for one, other in [(chain, found)] if found is first else [(chain, found), (unbroken, first)]:
         if other.confirmed and not (_contradicted(other) and _found_by_chance(one, other, trusted, judge)):
             return one, other
@@ -131,8 +131,8 @@ def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
     candidates = [(each, least) for each in agreed[:TRIED_AT_ONCE] if each is agreed[0] or each.at != agreed[0].at]
     if len(found.reduced.runs):
         runs = Runs.of(optimised(Fit(found.reduced, found.linear), MOST_STEPS), linear.poses, usual)
-        of_run, speaks = runs.likeliest_break(), runs.score(np.array([each.at for each in unlike], np.int64))
-        unlike = [each for each, score in zip(unlike, speaks, strict=True) if score > BY_CHANCE]
+        of_run, scores = runs.likeliest_break(), runs.score(np.array([each.at for each in unlike], np.int64))
+        unlike = [each for each, score in zip(unlike, scores, strict=True) if score > BY_CHANCE]
         if of_run is not None and of_run.log_evidence > BY_CHANCE:
             candidates.append((of_run, BY_CHANCE - of_run.log_evidence))
     candidates += [(each, max(least - each.log_evidence, BY_CHANCE)) for each in unlike]
