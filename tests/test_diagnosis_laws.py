@@ -238,7 +238,7 @@ def test_no_cycle_is_listed_twice() -> None:
     assert {len(name) for name in named} >= {2, 4}
 
 
-def test_a_reason_names_what_spoke_against_an_edge_whose_cycles_all_close() -> None:
+def test_a_reason_names_the_evidence_against_an_edge_whose_cycles_all_close() -> None:
     # the two edges 2-9 close over each other, and over nothing else
     clean = measured(poses_on_a_ring(16), np.concatenate([near_pairs(16, 3), [[2, 9]] * 2]))
     graph, _ = spoiled(clean, np.array([48, 49]))
@@ -247,7 +247,8 @@ def test_a_reason_names_what_spoke_against_an_edge_whose_cycles_all_close() -> N
     found = diagnose(replace(graph, i_from_j=motion), QUICK)
     for row in (48, 49):
         assert found.verdict[row] == WRONG
-        assert found.reason[row].startswith("1 of 1 cycles close, each over another edge that is left out; against it")
+        reason = "1 of 1 cycles close, each over another edge that is left out; all kept edges together place its ends"
+        assert found.reason[row].startswith(reason)
 
 
 def test_pieces_of_a_lattice_that_wrong_edges_cut_grow_again() -> None:

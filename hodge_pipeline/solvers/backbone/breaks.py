@@ -101,30 +101,33 @@ class PairwiseConsistency:
         counting as one; and the log Bayes factor (K,) of each loop of `among (K,)` given that one.
         """
         left = ~self.used[among]
-        rows = among[left]
+        support = np.full(len(among), -1.0)
+        support[left] = self._support(among[left])
+        for _ in range(SEEDS):
+            if not left.any():
+                return
+            row = int(np.argmax(np.where(left, support, -1.0)))
+            factor = self.factor(np.full(len(among), among[row]), among)
+            left &= factor <= 0
+            left[row] = False
+            yield int(among[row]), factor
+
+    def _support(self, rows: Ints) -> Floats:
+        """Nats (K,) that the nearest loops of each of `rows (K,)` gain if it is right, of its own place as one."""
         if not len(rows):
-            return
+            return np.zeros(0)
         near = cKDTree(self.chain.places[rows]).query(self.chain.places[rows], k=min(4 * NEIGHBOURS, len(rows)))[1]
         near = near.reshape(len(rows), -1)
         apart = np.abs(self.chain.places[rows[near]] - self.chain.places[rows][:, None]).max(axis=2) >= 1.0
         same = ~apart & (near != np.arange(len(rows))[:, None])
-        potential = np.zeros(len(rows))
+        support = np.zeros(len(rows))
         for kind in (apart, same):
             first, nth = np.nonzero(kind & (np.cumsum(kind, axis=1) <= NEIGHBOURS))
             second = rows[near[first, nth]]
             gain = np.maximum(np.logaddexp(self.factor(rows[first], second), 0.0) - self.by_chain[second], 0.0)
             share = 1.0 if kind is apart else 1 / np.bincount(first, minlength=len(rows))[first]
-            potential += np.bincount(first, share * gain, minlength=len(rows))
-        of_all = np.full(len(among), -1.0)
-        of_all[left] = potential
-        for _ in range(SEEDS):
-            if not left.any():
-                return
-            row = int(np.argmax(np.where(left, of_all, -1.0)))
-            factor = self.factor(np.full(len(among), among[row]), among)
-            left &= factor <= 0
-            left[row] = False
-            yield int(among[row]), factor
+            support += np.bincount(first, share * gain, minlength=len(rows))
+        return support
 
     def gains(self, seed: int, rows: Ints, factor: Floats) -> Floats:
         """Nats (K,) that the loops `rows (K,)` gain if `seed` is right, given their log Bayes factors (K,): each place
@@ -166,20 +169,13 @@ class StepModel:
         twist = chain.log(chain.step[rows])
         twist = np.concatenate([twist, twist @ _mirrored(chain, twist)])
         centre = np.median(twist, axis=0)
-        left, weight = twist - centre, np.ones(len(twist))
-        for _ in range(ROUNDS):
-            covariance = (left * weight[:, None]).T @ left / len(left)
-            covariance += np.diag(LEAST * np.diag(covariance) + np.finfo(float).tiny ** 0.5)
-            chi2 = mahalanobis(left, np.broadcast_to(covariance, (len(left), *covariance.shape)))[0]
-            weight = tail_weight(chi2, left.shape[1])
+        left = twist - centre
+        covariance = _student_covariance(left)
         whiten = np.linalg.inv(cholesky(covariance[None])[0]).T
         centres, shares, of_one = _kinds(left, left @ whiten)
         chi2 = cKDTree(centres @ whiten).query(left @ whiten)[0] ** 2
-        size = np.log(np.maximum(chi2[: len(rows)], np.finfo(float).tiny)) / 2
-        floor = np.quantile(size, 1 - TAIL)
-        mean = float(np.mean(size[size > floor] - floor)) if (size > floor).any() else np.inf
         unusual = np.full(chain.size, -np.inf)
-        unusual[rows] = np.maximum((size - floor) / mean + np.log(1 / TAIL), 0.0) - np.log(len(rows))
+        unusual[rows] = _rarity(chi2[: len(rows)]) - np.log(len(rows))
         kind = np.zeros(chain.size, bool)
         kind[rows] = of_one[: len(rows)]
         return cls(chain.exp(centre + centres), shares, covariance, kind, unusual)
@@ -187,6 +183,25 @@ class StepModel:
     def off(self, chain: Chain, motion: Floats) -> Floats:
         """Twists (K, M, p) from each kind's centre to motions (M, 4, 4)."""
         return chain.log(chain.between(self.centres[:, None], motion))
+
+
+def _student_covariance(left: Floats) -> Floats:
+    """The covariance (p, p) of residuals (M, p), with weights by Student's t."""
+    weight = np.ones(len(left))
+    for _ in range(ROUNDS):
+        covariance = (left * weight[:, None]).T @ left / len(left)
+        covariance += np.diag(LEAST * np.diag(covariance) + np.finfo(float).tiny ** 0.5)
+        chi2 = mahalanobis(left, np.broadcast_to(covariance, (len(left), *covariance.shape)))[0]
+        weight = tail_weight(chi2, left.shape[1])
+    return covariance
+
+
+def _rarity(chi2: Floats) -> Floats:
+    """Minus the log-probability (M,) of a larger χ², by an exponential tail of the logarithms of these (Hill 1975)."""
+    size = np.log(np.maximum(chi2, np.finfo(float).tiny)) / 2
+    floor = np.quantile(size, 1 - TAIL)
+    mean = float(np.mean(size[size > floor] - floor)) if (size > floor).any() else np.inf
+    return np.asarray(np.maximum((size - floor) / mean + np.log(1 / TAIL), 0.0))
 
 
 def _mirrored(chain: Chain, twist: Floats) -> Floats:

@@ -117,13 +117,17 @@ class _Trial:
             if (used == before).all() or not confirmed:
                 break
             linear = best.fit.linear
-        used |= trusted
+        return self.final(used | trusted, shares, linear, confirmed)
+
+    def final(self, used: Bools, shares: Floats, linear: Linear, confirmed: bool) -> Inferred:
+        """All loops judged at the poses of the used ones (M,), of which those that remain likely are used."""
+        start, chain, trusted = self.start, self.start.chain, self.trusted
         reduced = thinned(chain, np.flatnonzero(used))
         # wrong loops may have led into a local minimum that the right ones do not leave
         fit = min((optimised(Fit(reduced, begun), MOST_STEPS) for begun in (linear, start)), key=lambda each: each.cost)
         judged = judge(fit.linear, fit, shares, self.outliers)
         shares, top = mixture(judged.factor)
-        used &= (judged.log_odds > 0) | trusted
+        used = used & ((judged.log_odds > 0) | trusted)
         if np.log(shares[0] / shares[1]) < MISTAKEN:
             used &= ~_single_joins(chain, used) | trusted
         linear, reduced = fit.linear if used.any() else start, thinned(chain, np.flatnonzero(used))
