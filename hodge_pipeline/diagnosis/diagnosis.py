@@ -39,6 +39,8 @@ from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 DEFAULTS = DiagnosisOptions()
 LIKELIER_RIGHT = 0.5
+"""Least probability by the solution of an edge that shares the blame and is untestable: one below is wrong or suspect.
+"""
 
 
 @one_blas_thread
