@@ -12,9 +12,9 @@ from hodge_pipeline.diagnosis.options import WRONG_BELOW, DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
 from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.solvers.backbone import fit
-from hodge_pipeline.solvers.backbone.anyway import backbone_anyway
 from hodge_pipeline.solvers.backbone.chain import linear_forest, make_chain, sequential_edges
-from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, linearise, root, settled
+from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, cholesky, linearise, optimised
+from hodge_pipeline.solvers.backbone.lattice import lattice_backbone
 from hodge_pipeline.solvers.backbone.sparse import NormalEquations
 from hodge_pipeline.solvers.backbone.trust import find_backbone, of_every_loop
 from hodge_pipeline.solvers.maximum_likelihood import solve
@@ -63,7 +63,7 @@ def test_the_reduced_chain_ends_at_the_minimum_over_all_poses(monkeypatch: pytes
     graph = drive(dimension=dimension, wrong=0.0, loops=30).graph
     chain = chain_of(graph)
     bare = Fit(Reduced.of(chain, np.arange(len(chain.loop_edge))), linearise(chain, chain.poses))
-    found = settled(bare, 30)
+    found = optimised(bare, 30)
     assert found.cost < bare.cost / 10
     exact = solve(graph)
     again = solve(graph, start=found.linear.poses[np.argsort(chain.order)], initial="given")
@@ -83,11 +83,11 @@ def test_an_odometry_that_turns_wrongly_by_six_degrees_a_step_is_solved(monkeypa
 def test_left_out_residuals_are_those_of_a_solve_without_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fit, "LEAST_WON", 1e-12)
     chain = chain_of(drive(wrong=0.0, loops=12).graph)
-    found = settled(Fit(Reduced.of(chain, np.arange(12)), linearise(chain, chain.poses)), 30)
+    found = optimised(Fit(Reduced.of(chain, np.arange(12)), linearise(chain, chain.poses)), 30)
     without = found.left_out(found.reduced.of_loops)[0]
     for row in (0, 5, 11):
         others = Reduced.of(chain, np.delete(np.arange(12), row))
-        actual = settled(Fit(others, found.linear), 30).linear.loops[0][row]
+        actual = optimised(Fit(others, found.linear), 30).linear.loops[0][row]
         np.testing.assert_allclose(without[row], actual, atol=0.03 * np.abs(actual).max() + 2e-3)
 
 
@@ -162,7 +162,7 @@ def test_where_nothing_is_stated_wrong_loops_do_not_discard_the_odometry(seed: i
 
 def test_a_covariance_that_sums_left_indefinite_has_a_root() -> None:
     covariance = np.array([np.diag([4.0, 1.0]), [[1.0, 1.001], [1.001, 1.0]]])
-    found = root(covariance)
+    found = cholesky(covariance)
     np.testing.assert_allclose(found @ np.swapaxes(found, 1, 2), covariance, atol=2e-3)
 
 
@@ -254,10 +254,10 @@ def test_groups_of_wrong_loops_do_not_outvote_the_backbone_of_a_lattice() -> Non
     steps = np.abs(np.diff(made.graph.edges, axis=1)[:, 0]) == 1
     cut = np.flatnonzero(steps)[40:400:60]
     kept = ~np.isin(np.arange(made.graph.edge_count), cut)  # more edges than are right, and six steps fewer
-    backbone, explains_more = backbone_anyway(made.graph, kept)
+    backbone, explains_more = lattice_backbone(made.graph, kept)
     assert backbone is not None
     np.testing.assert_array_equal(backbone.used, made.right)
-    assert backbone_anyway(made.graph, made.right | ~steps) == (None, False)
+    assert lattice_backbone(made.graph, made.right | ~steps) == (None, False)
 
 
 @pytest.mark.parametrize("wrong", [0.3, 1.0])

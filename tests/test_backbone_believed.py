@@ -12,7 +12,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.refine.pose_graph import read_graph
-from hodge_pipeline.solvers.backbone.chain import believed, sequential_edges
+from hodge_pipeline.solvers.backbone.chain import credible_steps, sequential_edges
 from hodge_pipeline.types import Floats, ViewGraph
 from tests.backbone_graphs import drive
 from tests.test_backbone import NEVER_WORSE
@@ -50,9 +50,9 @@ def test_what_is_believed_of_steps() -> None:
     graph = drive(dimension=3, wrong=0.0, loops=10).graph
     steps = sequential_edges(graph)
     for stated in (graph, replace(graph, information=np.tile(np.eye(6), (graph.edge_count, 1, 1)))):
-        same, as_stated = believed(stated, steps)
+        same, as_stated = credible_steps(stated, steps)
         assert same is stated and as_stated
-    changed, as_stated = believed(stating(graph, OF_ROBOTS), steps)
+    changed, as_stated = credible_steps(stating(graph, OF_ROBOTS), steps)
     assert not as_stated
     np.testing.assert_array_equal(changed.information[~steps], graph.information[~steps])
     errors = np.sqrt(np.diag(np.linalg.inv(changed.information[steps][0])))
@@ -60,7 +60,7 @@ def test_what_is_believed_of_steps() -> None:
     moved = se3.log(graph.i_from_j[steps])
     np.testing.assert_allclose(errors[5], 0.2 * np.sqrt(np.mean(moved[:, 3:] ** 2)), rtol=1e-6)
     np.testing.assert_allclose(errors[:3], 0.2 * np.sqrt(np.mean(moved[:, :3] ** 2)), rtol=1e-6)
-    nothing, as_stated = believed(graph, np.zeros_like(steps))
+    nothing, as_stated = credible_steps(graph, np.zeros_like(steps))
     assert nothing is graph and as_stated
 
 
@@ -71,13 +71,13 @@ def test_a_direction_that_few_steps_do_not_measure_is_as_stated() -> None:
     sliding = np.flatnonzero(sequential_edges(graph))[100:150]
     information[sliding, 3, 3] = 1e-3
     stated = replace(graph, information=information)
-    assert believed(stated, sequential_edges(graph))[0] is stated
+    assert credible_steps(stated, sequential_edges(graph))[0] is stated
 
 
 @pytest.mark.parametrize("name", ["parking-garage", "cubicle"])
 def test_information_of_a_radian_or_of_one_axis_that_is_known_far_better_is_believed(data_dir: Path, name: str) -> None:
     graph = read_graph(data_dir / f"pose_graphs/sesync/{name}.g2o").graph
-    assert graph is not None and believed(graph, sequential_edges(graph))[1]
+    assert graph is not None and credible_steps(graph, sequential_edges(graph))[1]
 
 
 @pytest.mark.parametrize("sigma", [1e-5, 1e-3])

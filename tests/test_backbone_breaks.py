@@ -9,7 +9,7 @@ import pytest
 from benchmarks.wrong_loops import simulated_cases
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.solvers.backbone.breaks import Usual
+from hodge_pipeline.solvers.backbone.breaks import StepModel
 from hodge_pipeline.solvers.backbone.chain import make_chain
 from hodge_pipeline.solvers.backbone.inference import BY_CHANCE
 from hodge_pipeline.solvers.backbone.trust import find_backbone
@@ -76,7 +76,7 @@ def test_a_step_like_no_other_is_unusual_where_every_fourth_turns() -> None:
     edges = np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
     graph = ViewGraph.from_edges(np.arange(count), edges, motion, np.tile(np.eye(6), (count - 1, 1, 1)), dimension=2)
     made = Drive(graph, np.tile(np.eye(4), (count, 1, 1)), np.ones(count - 1, bool))
-    unusual = Usual.of(make_chain(broken(made, at), np.ones(count - 1, bool))).unusual
+    unusual = StepModel.of(make_chain(broken(made, at), np.ones(count - 1, bool))).unusual
     assert np.argmax(unusual) == at + 1
     assert unusual[at + 1] > BY_CHANCE
     assert np.delete(unusual, at + 1).max() < BY_CHANCE

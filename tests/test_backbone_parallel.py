@@ -53,7 +53,7 @@ def test_the_mean_is_by_information_whichever_way_a_step_is_written() -> None:
     graph, rows = with_second_odometry(made, times=2.0)
     one = fused(graph, consecutive_edges(graph))
     assert one.graph.edge_count == made.edge_count
-    np.testing.assert_array_equal(np.sort(one.part), np.arange(made.edge_count, graph.edge_count))
+    np.testing.assert_array_equal(np.sort(one.merged), np.arange(made.edge_count, graph.edge_count))
     ahead = in_vertex_order(graph)[0].i_from_j[made.edge_count :]
     apart = se3.log(se3.inverse(made.i_from_j[rows]) @ ahead)
     moved = se3.log(se3.inverse(made.i_from_j[rows]) @ one.graph.i_from_j[rows])
@@ -88,7 +88,7 @@ def test_copies_of_steps_are_the_same_steps_where_information_is_unknown() -> No
     unknown, twice = (
         replace(graph, information=np.tile(np.eye(6), (graph.edge_count, 1, 1))) for graph in (made.graph, twice)
     )
-    assert len(fused(twice, consecutive_edges(twice)).part) == len(rows)
+    assert len(fused(twice, consecutive_edges(twice)).merged) == len(rows)
     found, expected = diagnose(twice), diagnose(unknown)
     assert (found.kept[: unknown.edge_count] != expected.kept).sum() <= 1
     assert made.error_m(found.world_from_cam) < 1.1 * made.error_m(expected.world_from_cam)

@@ -172,7 +172,7 @@ def test_an_exact_window_in_any_unit_is_one(stated: bool, unit: float) -> None:
         information = se3.rescaled_information(information, unit) if stated else information
     exact = replace(graph, i_from_j=motions, information=information)
     one = windowed(whole(exact))
-    assert len(one.part) > 700 and not len(one.contradicted)
+    assert len(one.merged) > 700 and not len(one.contradicted)
     found = diagnose(exact)
     assert found.kept.all() and made.error_m(se3.rescaled(found.world_from_cam, 1 / unit)) < 1e-6
 

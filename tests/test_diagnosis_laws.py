@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from benchmarks.edge_scores import area_under_roc
 from diagnosis_graphs import SIGMA, every_pair_tried, measured, near_pairs, poses_on_a_ring, spoiled
 from hodge_pipeline import se3
-from hodge_pipeline.complex.judging import chi2_by_information, left_over, mean_variances, squares_at_both_ends
+from hodge_pipeline.complex.judging import chi2_by_information, mean_variances, residual_twists, squares_at_both_ends
 from hodge_pipeline.complex.short_cycles import short_cycles
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
@@ -106,7 +106,7 @@ def test_the_chi2_of_an_edge_is_the_same_written_the_other_way_round() -> None:
     np.testing.assert_allclose(chi2_by_information(turned, poses), chi2_by_information(graph, poses), rtol=1e-8)
     for one, other in zip(mean_variances(turned, False), mean_variances(graph, False), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6)
-    squares = [squares_at_both_ends(each.i_from_j, left_over(each, poses)) for each in (graph, turned)]
+    squares = [squares_at_both_ends(each.i_from_j, residual_twists(each, poses)) for each in (graph, turned)]
     np.testing.assert_allclose(squares[0], squares[1], rtol=1e-8, atol=1e-15)
 
 
@@ -238,7 +238,7 @@ def test_no_cycle_is_listed_twice() -> None:
     assert {len(name) for name in named} >= {2, 4}
 
 
-def test_a_reason_names_what_spoke_against_an_edge_whose_cycles_all_close() -> None:
+def test_a_reason_names_the_evidence_against_an_edge_whose_cycles_all_close() -> None:
     # the two edges 2-9 close over each other, and over nothing else
     clean = measured(poses_on_a_ring(16), np.concatenate([near_pairs(16, 3), [[2, 9]] * 2]))
     graph, _ = spoiled(clean, np.array([48, 49]))
@@ -247,7 +247,8 @@ def test_a_reason_names_what_spoke_against_an_edge_whose_cycles_all_close() -> N
     found = diagnose(replace(graph, i_from_j=motion), QUICK)
     for row in (48, 49):
         assert found.verdict[row] == WRONG
-        assert found.reason[row].startswith("1 of 1 cycles close, each over another edge that is left out; against it")
+        reason = "1 of 1 cycles close, each over another edge that is left out; all kept edges together place its ends"
+        assert found.reason[row].startswith(reason)
 
 
 def test_pieces_of_a_lattice_that_wrong_edges_cut_grow_again() -> None:

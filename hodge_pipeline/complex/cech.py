@@ -16,9 +16,10 @@ from hodge_pipeline.complex.coboundary import check_edges
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, Ints
 
-CANDIDATES_AT_ONCE = 2_000_000
-SIMPLICES_AT_ONCE = 2_000
+CANDIDATES_AT_ONCE, SIMPLICES_AT_ONCE = 2_000_000, 2_000
+"""Candidate triangles of a batch, and triangles of which occupancy is intersected at once: limits on memory."""
 MOST_LISTED = 50_000_000
+"""Triangles, 24 bytes each: a limit on memory."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""How well cycles close: what the motions along each leave over, and whether chance would let them close so well."""
+"""Closing errors of cycles, and whether they close better than by chance."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from hodge_pipeline.complex.short_cycles import short_cycles
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 AT_MIDDLE = 4
-"""Frames of a cycle, the first ones, whose middle is where its displacement is measured."""
+"""Number of first frames of a cycle at whose centre its displacement is measured."""
 LEVEL = 0.01
-"""Choices of edges that agree so well by chance, expected among all: as the gate of the edges, which 1 % miss."""
+"""Expected number of choices of edges, among all, that close so well by chance: as the 1 % gate of edges."""
 UNIFORM_RAD2 = (8 * math.pi**2) ** (2 / 3) / (2 * math.pi)
 """Variance of an axis at which a Gaussian is as dense at 0 as uniform rotations, which spread no wider."""
 FLAT = 100.0
-"""Times as large as usual along the axis that moves most are squares of motions along one that holds noise alone."""
+"""Ratio of the median squares of motions, to that of the largest axis, below which an axis holds noise alone."""
 FAR = 1e6
-"""Squared distance of an aim, in the variances of a walk, from which on that walk is no evidence."""
+"""Squared distance of an aim, in variances of a walk, beyond which the walk is no evidence."""
 LEAST_VARIANCE = 1e-200
-"""Of a walk of edges that do not move, so that what is divided by it stays finite."""
+"""Least variance of a walk, of edges that do not move, to divide by."""
 TRIANGLES_PER_EDGE = 8
-"""Of which all but the first that holds an edge are the same evidence again."""
+"""Most triangles listed per edge: all but the first over an edge repeat its evidence."""
 
 
 def cycle_errors(loops: Loops, i_from_j: Floats) -> tuple[Floats, Floats]:
-    """The angle (L,) in radians and the displacement (L,) in metres that the product of motions along each cycle
-    leaves, the latter at the middle of the cycle's frames.
+    """The closing error of each cycle: angle (L,), radians, and displacement (L,) at the centre of its first frames,
+    metres.
     """
     return errors_of_products(loop_products(loops, i_from_j), loops, i_from_j)
 
 
 def errors_of_products(products: Floats, loops: Loops, i_from_j: Floats) -> tuple[Floats, Floats]:
-    """The same where the products (L, 4, 4) are known."""
+    """`cycle_errors` of cycles whose products of motions (L, 4, 4) are given."""
     middle = _middles(loops, i_from_j)
     displacement_m = np.einsum("lij,lj->li", products[:, :3, :3], middle) + products[:, :3, 3] - middle
     return np.linalg.norm(se3.so3_log(products[:, :3, :3]), axis=1), np.linalg.norm(displacement_m, axis=1)
@@ -56,12 +56,12 @@ def _middles(loops: Loops, i_from_j: Floats) -> Floats:
 def closes_better_than_chance(graph: ViewGraph, kept: Ints) -> bool:
     """Whether the cycles of the kept edges (rows) close so well that no choice of random edges is expected to.
 
-    Edges are revealed cycle by cycle, the shortest first. Each cycle with a run of edges that no cycle before it holds
-    is a test of its own: whatever the others are, a walk of the lengths of that run in random directions ends as
-    near to where the rest of the cycle leads with a probability that is uniform. So minus the sum of the logarithms
-    is gamma distributed although cycles share edges. Every choice of as many of the edges counts, whichever the
-    solver made: so that it chose the best makes nothing look better than it is. Not held against it: edges which all
-    go the same way in their own frames; and rotations, or translations, that are noise alone hide what the others say.
+    Cycles are taken shortest first. Each with a run of edges that no cycle before it holds is an independent test:
+    under the null hypothesis that run is a walk of the same lengths in random directions, and the probability that it
+    ends as near to where the rest of the cycle leads is uniform. So minus the sum of the logarithms is gamma
+    distributed, although cycles share edges. A Bonferroni factor counts all choices of as many edges, since the solver
+    chose the best. Limits: edges that all go the same way in their own frames are not random; and rotations, or
+    translations, that are noise alone mask the others.
     """
     graph, every = graph.select(kept), graph.edge_count
     loops, run = _begun_at_new_edges(short_cycles(graph.edges, graph.vertex_count, TRIANGLES_PER_EDGE))
@@ -75,7 +75,7 @@ def closes_better_than_chance(graph: ViewGraph, kept: Ints) -> bool:
 
 
 def _begun_at_new_edges(loops: Loops) -> tuple[Loops, Ints]:
-    """The cycles that hold an edge which no shorter or earlier one does, each begun at its first run of such edges;
+    """The cycles with an edge that no cycle before holds, shortest first, each begun at its first run of such edges;
     and the length (L,) of that run.
     """
     loops = loops.select(np.argsort(loops.lengths, kind="stable"))
@@ -97,8 +97,8 @@ def _begun_at_new_edges(loops: Loops) -> tuple[Loops, Ints]:
 
 
 def _log_chance(loops: Loops, run: Ints, i_from_j: Floats) -> Floats:
-    """The logarithm of how likely (L,) walks of the first `run (L,)` motions of the cycles, turned at random, end as
-    near as these do to where the others lead.
+    """The log-probability (L,) that the first `run (L,)` motions of each cycle, in random directions, end as near as
+    they do to where the others lead.
 
     Rotations are judged as if the others did not turn, which makes no chance smaller (Anderson, 1955).
     """
@@ -119,11 +119,11 @@ def _log_chance(loops: Loops, run: Ints, i_from_j: Floats) -> Floats:
 
 
 def _moving(of_edges: Floats, of_aims: Floats) -> Bools:
-    """The axes (3,) along which edges (E, 3) or what cycles say of them (L, 3) move, not by noise out of a plane."""
+    """The axes (3,) along which edges (E, 3) or aims (L, 3) move by more than noise out of a plane."""
     usual = np.maximum(np.median(of_edges**2, axis=0), np.median(of_aims**2, axis=0))
     return np.asarray(usual > usual.max() / FLAT)
 
 
 def _variance(motions: Floats) -> Floats:
-    """Along each of the axes (N,) where motions (N, a) of these lengths go in random directions."""
+    """The variance per axis (N,) of motions of the lengths of these (N, a) in random directions."""
     return np.asarray((motions**2).sum(axis=1) / max(motions.shape[1], 1))

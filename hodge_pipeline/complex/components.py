@@ -11,9 +11,8 @@ from hodge_pipeline.complex.coboundary import check_edges
 from hodge_pipeline.types import Bools, Ints
 from hodge_pipeline.types.text import counted
 
-MOST_PIECES_LISTED = 8
-
-MAX_RUNS_LISTED = 12
+MOST_PIECES_LISTED, MAX_RUNS_LISTED = 8, 12
+"""In a note; of more their number."""
 
 
 def connected_components(edges: Ints, vertex_count: int) -> Ints:

@@ -1,4 +1,4 @@
-"""Whether motions are the inverse of what they are read as: written by another convention, or between swapped ids."""
+"""Whether a graph's motions are inverted: written by the other convention, or between swapped ids."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.cycles import edge_between, root_from_vertex, spanning_forest
-from hodge_pipeline.complex.judging import left_over
+from hodge_pipeline.complex.judging import residual_twists
 from hodge_pipeline.types import Ints, ViewGraph
 
 NEARER = 4.0
-"""Times as near half of the cycles close by the inverse motions. Of 90 real and 1000 simulated graphs that are read as
-they were meant it is at most 2.3; read the other way it is 5 to 12 of Intel, garage, EECS and Duderstadt.
+"""Least ratio of the median closing error to that with inverse motions. Of 90 real and 1000 simulated graphs that are
+read as they were meant it is at most 2.3; read the other way it is 5 to 12 of Intel, garage, EECS and Duderstadt.
 """
 FEWEST_CYCLES = 3
 ROUNDED = 1e-6
-"""Of an edge's length: cycles that close so well say nothing but how numbers were rounded."""
+"""Share of the median edge length: closing errors below are those of rounded numbers."""
 
 
 def inverted_notes(graph: ViewGraph) -> tuple[str, ...]:
-    """A line where cycles close far better if every motion (E, 4, 4) is inverted, by translations, which planar graphs
-    tell apart too; none if not.
+    """A note if cycles close far better with every motion (E, 4, 4) inverted, by translations, which differ in the
+    plane too; else none.
     """
     tree = nearest_tree(graph.edges, graph.vertex_count)
     cycles = np.setdiff1d(np.arange(graph.edge_count), tree)
@@ -52,6 +52,6 @@ def nearest_tree(edges: Ints, vertex_count: int) -> Ints:
 
 
 def _median_miss_m(graph: ViewGraph, tree: Ints, cycles: Ints) -> float:
-    """How far the other edges are from the poses that those of the tree lead to."""
+    """The median residual of translation of the edges `cycles` at poses along the tree, metres."""
     poses = root_from_vertex(spanning_forest(graph.edges[tree], graph.vertex_count), graph.i_from_j[tree])
-    return float(np.median(np.linalg.norm(left_over(graph.select(cycles), poses)[:, 3:], axis=1)))
+    return float(np.median(np.linalg.norm(residual_twists(graph.select(cycles), poses)[:, 3:], axis=1)))

@@ -14,8 +14,8 @@ from hodge_pipeline.complex.energies import Energies
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, Ints
 
-RELATIVE_RESIDUAL = 1e-13
-ENOUGH = 1e-9
+RELATIVE_RESIDUAL, ENOUGH = 1e-13, 1e-9
+"""Gradient norms, relative to that of ω without its exact part: one ends conjugate gradients, one they must reach."""
 
 
 @dataclass(frozen=True)

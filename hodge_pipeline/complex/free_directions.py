@@ -43,12 +43,12 @@ def free_direction_notes(graph: ViewGraph) -> tuple[str, ...]:
     frames = np.flatnonzero(free.any(axis=1))
     if not len(frames):
         return ()
-    told = [
+    named = [
         f"{graph.vertex_ids[k]} ({'; '.join(named_direction(vector) for vector in vectors[k].T[free[k]])})"
         for k in frames[:NAMED]
     ]
     more = f", {len(frames) - NAMED} more" if len(frames) > NAMED else ""
-    whose = f"{counted(len(frames), 'frame')}, in their axes: {', '.join(told)}{more}"
+    whose = f"{counted(len(frames), 'frame')}, in their axes: {', '.join(named)}{more}"
     return (f"no edge measures these motions of {whose}",)
 
 

@@ -22,35 +22,35 @@ REGISTERED_FREEDOM = 30.0
 """
 MEDIAN_CHI2 = {axes: float(chdtri(axes, 0.5)) for axes in (1, 3, 6)}
 EXACT = 1e-9
-"""Of the largest χ²: edges in no cycle fit exactly, and tell nothing about the usual χ²."""
+"""Share of the largest χ² below which an edge fits exactly, being in no cycle, and is no sample of the usual χ²."""
 UNMEASURED = 1e-9
-"""Of an eigenvalue, in units that make the information's diagonal one: where it is less, nothing was measured."""
+"""Least eigenvalue of information scaled to a unit diagonal: where it is less, nothing was measured."""
 
 
-def left_over(graph: ViewGraph, world_from_cam: Floats) -> Floats:
-    """ξ (E, 6), rotation and translation in j's axes: the motion that each edge and the poses (V, 4, 4) leave over."""
+def residual_twists(graph: ViewGraph, world_from_cam: Floats) -> Floats:
+    """Residual twists ξ = log(Z⁻¹ T_i⁻¹ T_j) (E, 6) at poses (V, 4, 4): rotation, translation, in j's axes."""
     i, j = graph.edges.T
     return se3.log(se3.inverse(graph.i_from_j) @ se3.inverse(world_from_cam[i]) @ world_from_cam[j])
 
 
 def chi2_by_information(graph: ViewGraph, world_from_cam: Floats) -> Floats:
     """χ² (E,) by the graph's own information, 6 on average where information and poses are right."""
-    xi = left_over(graph, world_from_cam)
+    xi = residual_twists(graph, world_from_cam)
     return np.asarray(np.einsum("ea,eab,eb->e", xi, graph.information, xi))
 
 
 def tail_weight(chi2: Floats | float, axes: int) -> Floats:
-    """The weight that Student's t gives each χ² of so many axes: 1 where it is as expected, more below."""
+    """The weight of Student's t for each χ² of `axes` dimensions: 1 at the expected χ², more below."""
     return np.asarray((FREEDOM + axes) / (FREEDOM + np.asarray(chi2)))
 
 
 def tail_gate(axes: int, share: float) -> float:
-    """The χ² beyond which so small a share of right edges lies: by Fisher's F, as Student's t has it."""
+    """The χ² that this share of right edges exceeds: a quantile of Fisher's F, since errors follow Student's t."""
     return axes * float(fdtri(axes, FREEDOM, 1 - share))
 
 
 STUDENT_99 = {axes: tail_gate(axes, 0.01) for axes in (3, 6)}
-"""Of so many axes, the χ² beyond which an edge is no error: the 99 % quantile of Student's t."""
+"""The χ² gate of an edge, by its number of axes: the 99 % quantile under Student's t."""
 
 
 def student_weight(chi2: Floats, axes: int, *, usual: Floats, registered: bool = False) -> Floats:
@@ -66,14 +66,14 @@ def student_weight(chi2: Floats, axes: int, *, usual: Floats, registered: bool =
 
 
 def squares_at_both_ends(i_from_j: Floats, xi: Floats) -> tuple[Floats, Floats]:
-    """The squares (E,) of what is left over: rad² of rotation, m² of translation, the latter the mean of both ends."""
+    """Squared residuals (E,) of twists (E, 6): rotation, rad², and translation, m², the mean of both ends."""
     turn, here = xi[:, :3], xi[:, 3:]
-    there = here + np.cross(turn, _ahead(i_from_j))
+    there = here + np.cross(turn, _i_origin_in_j(i_from_j))
     return (turn**2).sum(axis=1), ((here**2).sum(axis=1) + (there**2).sum(axis=1)) / 2
 
 
-def _ahead(i_from_j: Floats) -> Floats:
-    """Frame i's origin (E, 3) in j's axes: where Ad(Z) takes a translation to be measured, up to a rotation."""
+def _i_origin_in_j(i_from_j: Floats) -> Floats:
+    """Frame i's origin (E, 3) in j's axes: residuals of translation at i are taken there."""
     return np.asarray(-np.einsum("eji,ej->ei", i_from_j[:, :3, :3], i_from_j[:, :3, 3]))
 
 

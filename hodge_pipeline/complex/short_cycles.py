@@ -11,9 +11,10 @@ from hodge_pipeline.complex.cycles import Loops, fundamental_loops, spanning_for
 from hodge_pipeline.types import Bools, Ints
 
 NEIGHBOURS = 8
-"""Of each end of an edge that are tried for a square."""
+"""Neighbours of each end of an edge that are tried for a square: a limit on cost."""
 EDGES_AT_ONCE = 20_000
 LONGEST_ENTRIES = 5_000_000
+"""Edges of all loops of chords together: a limit on memory."""
 
 
 def short_cycles(edges: Ints, vertex_count: int, most_per_edge: int) -> Loops:
@@ -116,7 +117,9 @@ def _some_neighbours(edges: Ints, vertex_count: int) -> Ints:
 
 
 def loops_of_chords(edges: Ints, vertex_count: int) -> Loops:
-    """The loops of the chords of a tree, the shortest of them, as long as together they are not too long."""
+    """The fundamental loops of a spanning forest, without self-loops: the shortest, up to `LONGEST_ENTRIES` edges in
+    all.
+    """
     forest = spanning_forest(edges, vertex_count)
     chords = forest.chords[edges[forest.chords, 0] != edges[forest.chords, 1]]
     depth = forest.depth[edges[chords]].sum(axis=1)

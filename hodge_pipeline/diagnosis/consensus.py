@@ -1,10 +1,9 @@
 """The solution that most edges agree with, and the probability that each edge is right, given that solution.
 
-Growing pieces best first can take a place for another that looks like it, and from there no single move leads back. So
-a second start begins with the paths of consecutive views, which are wrong more rarely. Where every pair was tried, the
-local search begins at both, the pieces of both then grow into one another, and the solution with the larger
-log-evidence is taken. Elsewhere a third one begins with chordal poses of all edges, from which those that do not follow
-fall out.
+Greedy merging can mistake a place for another that looks like it, and no single move then leads back. So a second start
+begins with the paths of consecutive views, which are wrong more rarely. Where every pair was tried, the local search
+begins at both, the pieces that result are merged on, and the solution with the larger log-evidence is taken. Elsewhere
+a third start begins with chordal poses of all edges, from which edges beyond the gate are dropped.
 """
 
 from __future__ import annotations
@@ -22,10 +21,12 @@ from hodge_pipeline.diagnosis.search import LARGEST, searched
 from hodge_pipeline.types import Floats
 
 PRIOR_SHARE = 0.25
-"""Of the prior's log odds. The probability, its root of 1 - chi2 / gate among it, was chosen for calibration: of right
-edges of 90 simulated rings, corridors and streets and 16 rooms, and of nine graphs of real fragments.
+"""Share of the prior's log-odds in those of an edge. With it, and the root of 1 - chi2 / gate, probabilities are
+calibrated on right edges of 90 simulated rings, corridors and streets and 16 rooms, and of nine graphs of real
+fragments.
 """
 EXTREME = 0.01
+"""Least distance of a probability from 0 and 1, before the prior."""
 EVERY = 1e9
 """A gate that lets every edge pass."""
 
@@ -39,8 +40,9 @@ def find_consensus(evidence: Evidence) -> Solved:
 
 
 def sought_from(evidence: Evidence, best: Solved, start: Floats) -> Solved:
-    """The best solution so far, or that which poses `start (V, 4, 4)` lead to where more edges agree with it: groups of
-    wrong loops may leave less of χ² where they have torn a graph.
+    """The solution from poses `start (V, 4, 4)`, if it uses more edges than the best so far, else the best.
+
+    χ² does not decide: that of a graph torn by groups of wrong loops may be smaller.
     """
     begun = Alignment(np.zeros(len(start), np.int64), start)
     other = fit(evidence, fit(evidence, begun, ANNEALED), (GATE,))
@@ -56,8 +58,8 @@ def agreeing(evidence: Evidence, found: Solved) -> Floats:
 
 
 def best_arrangement(evidence: Evidence, start: Solved) -> Solved:
-    """The arrangement with the largest log-evidence, from `start` and from the order; `start` itself where there are
-    too many views.
+    """The solution with the largest log-evidence, searched from `start` and from the paths of consecutive views;
+    `start` itself where there are more than `LARGEST` views.
     """
     if not 2 < evidence.graph.vertex_count <= LARGEST:
         return start
@@ -70,9 +72,9 @@ def best_arrangement(evidence: Evidence, start: Solved) -> Solved:
 
 
 def _mended(evidence: Evidence, grown: Alignment) -> Solved:
-    """The solution that grown pieces lead to where the order tells nothing of pairs that were tried."""
+    """The solution from grown pieces, and from other starts, where not every pair was tried."""
     graph, best = evidence.graph, fit(evidence, grown, ANNEALED)
-    # a ring of many edges hides a whole turn, which no descent undoes and chordal rotations have not
+    # a ring of many edges may wind once too often, a local minimum that chordal rotations avoid
     best = min((fit(evidence, best, (GATE,), initial=name) for name in ("given", "chordal")), key=_misfit)
     if graph.edge_count > LARGE:  # one exact solve is all that there is time for
         return best
@@ -84,13 +86,13 @@ def _mended(evidence: Evidence, grown: Alignment) -> Solved:
 
 
 def _in_order(evidence: Evidence) -> Alignment:
-    """The alignment that begins with the paths of consecutive edges: where a chain hangs by one end and by wrong edges,
-    no cycle tells that it is these.
+    """The alignment grown from the paths of consecutive edges: no cycle shows which edges are wrong where a chain hangs
+    by one end and by wrong ones.
     """
     steps = np.abs(evidence.graph.edges[:, 1] - evidence.graph.edges[:, 0]) == 1
     return align(evidence, align(evidence.select(np.flatnonzero(steps))))
 
 
 def _misfit(found: Solved) -> float:
-    """χ² of all edges, of each no more than the gate."""
+    """The truncated χ² of all edges: each no more than the gate."""
     return float(np.minimum(found.chi2, GATE).sum())

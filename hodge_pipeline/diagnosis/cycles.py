@@ -15,17 +15,18 @@ from hodge_pipeline.types import Bools, Floats, Ints
 CLOSES_BELOW = 30.0
 """χ² over six dimensions of a cycle that closes, and of two edges that agree. Generous, since tails are heavy."""
 WITNESSES = 3
-"""Cycles that are named for an edge."""
+"""Most cycles for, and most against, that an edge names."""
 SIGMAS = 4.0
-"""By which more cycles must close well than do by chance: 118 and more do in eight graphs of the literature, 12 and 24
-in two lattices with wrong edges; where all loops are random up to 3.5, but 64 in one of the eight with parallel edges.
+"""Standard deviations by which more cycles must close well than by chance: 118 and more do in eight graphs of the
+literature, 12 and 24 in two lattices with wrong edges; where all loops are random up to 3.5, but 64 in one of the eight
+with parallel edges.
 """
 
 
 @dataclass(frozen=True)
 class Cycles:
-    """The cycles that were listed: their edges, the angle (L,) and displacement (L,) that each leaves, its χ² (L,) in
-    the noise of its edges, and whether it closes (L,).
+    """The listed cycles: edges, closing errors `angle_rad`, `displacement_m (L,)`, `chi2 (L,)` by the noise of the
+    edges, and which of them are within the gate, `closes (L,)`.
     """
 
     loops: Loops
@@ -36,7 +37,7 @@ class Cycles:
 
 
 def judge_cycles(loops: Loops, angle: Floats, displacement_m: Floats, noise: Noise, reach_m: float) -> Cycles:
-    """The cycles with their χ²: variances add along a cycle, and angles swing what follows them."""
+    """The cycles with their χ²: variances of edges add up, and rotations also move what follows, by `reach_m`."""
     turn, shift = loops.sums(noise.rotation_rad**2), loops.sums(noise.translation_m**2)
     swing = turn * (reach_m * loops.lengths) ** 2 / 12
     chi2 = angle**2 / np.maximum(turn, 1e-300) + displacement_m**2 / np.maximum(shift + swing, 1e-300)
@@ -44,8 +45,10 @@ def judge_cycles(loops: Loops, angle: Floats, displacement_m: Floats, noise: Noi
 
 
 def close_by_chance(cycles: Cycles, i_from_j: Floats, noise: Noise, reach_m: float) -> bool:
-    """Whether cycles close well, as half of right ones do, no more often than with the motions (E, 4, 4) dealt anew
-    among their edges: where most of these are wrong, or errors as large as motions, cycles that close say nothing.
+    """Whether cycles close to below the median χ² hardly more often than with motions (E, 4, 4) permuted among the
+    edges.
+
+    Then most edges are wrong, or stated errors as large as the motions, and closing cycles are no evidence.
     """
     dealt = i_from_j[np.random.default_rng(0).permutation(len(i_from_j))]
     others = judge_cycles(cycles.loops, *cycle_errors(cycles.loops, dealt), noise, reach_m)
@@ -65,7 +68,7 @@ def usual_share(cycles: Cycles) -> float:
 
 
 def closing_support(cycles: Cycles, prior: Floats) -> Floats:
-    """How many cycles (E,) close over each edge, each weighed by how likely its other edges are."""
+    """How many cycles (E,) close over each edge, each weighted by the prior of its other edges."""
     strength = np.maximum(0.0, 1 - cycles.chi2 / CLOSES_BELOW)
     return cycles.loops.sums_at_edges(strength * np.exp(cycles.loops.sums(np.log(prior))), len(prior)) / prior
 

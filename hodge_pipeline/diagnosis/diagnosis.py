@@ -30,8 +30,8 @@ from hodge_pipeline.diagnosis.robust_poses import Solved
 from hodge_pipeline.diagnosis.shared_blame import share_blame
 from hodge_pipeline.diagnosis.wording import reasons
 from hodge_pipeline.one_blas_thread import one_blas_thread
-from hodge_pipeline.solvers.backbone.anyway import backbone_anyway
 from hodge_pipeline.solvers.backbone.chain import vertex_ranks
+from hodge_pipeline.solvers.backbone.lattice import lattice_backbone
 from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
 from hodge_pipeline.solvers.resistance import Network
 from hodge_pipeline.solvers.weights import OUT_OF_PLANE, dimension_of
@@ -39,6 +39,8 @@ from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 DEFAULTS = DiagnosisOptions()
 LIKELIER_RIGHT = 0.5
+"""Least probability by the solution of an edge that shares the blame and is untestable: one below is wrong or suspect.
+"""
 
 
 @one_blas_thread
@@ -55,9 +57,7 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
 
 
 def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbone | Diagnosis:
-    """The backbone of a graph that has one, else the diagnosis that trusts no edge, as of a room of which every pair of
-    views was tried.
-    """
+    """The backbone of a graph where one is trusted, else the diagnosis without one."""
     graph = replace(graph, dimension=dimension_of(graph))
     if options.trust == AUTO and every_pair_tried(vertex_ranks(graph)[graph.edges], graph.vertex_count):
         return _ByCycles.of(graph, options).found
@@ -68,19 +68,21 @@ def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbo
     if options.trust != AUTO or not graph.edge_count:
         return judged.found
     if judged.by_chance:
-        return backbone or find_backbone(graph, anyway=True) or judged.found
-    backbone, explains_more = backbone_anyway(graph, judged.found.kept, backbone)
+        return backbone or find_backbone(graph, in_lattice=True) or judged.found
+    backbone, explains_more = lattice_backbone(graph, judged.found.kept, backbone)
     if backbone is None or explains_more:
         return backbone or judged.found
-    # groups of wrong loops may have torn what its poses hold together
+    # groups of wrong loops may have torn the solution apart, which the poses of the backbone hold together
     return judged.sought_from(backbone.world_from_cam) if backbone.found.confirmed else judged.found
 
 
 @dataclass(frozen=True)
 class _ByCycles:
-    """What the cycles of a graph say, and the solution that most edges agree with, at the working point, whose frames
-    are `there (4, 4)` in those of the graph; edges that were `turned (E,)`. Its vertices stand in the order of their
-    ids, each at its `rank (V,)`, since poses drift along it.
+    """The diagnosis without a backbone, of vertices in the order of their ids, along which poses drift.
+
+    - `stated`: the graph as given; `rank (V,)`: of its vertices in that order; `turned (E,)`: edges that were inverted
+      to run from the lower to the higher rank.
+    - `there (4, 4)`: the frame at the working point in that of each camera; `evidence` and `cycles` are of such frames.
     """
 
     stated: ViewGraph
@@ -92,7 +94,7 @@ class _ByCycles:
 
     @classmethod
     def of(cls, stated: ViewGraph, options: DiagnosisOptions) -> _ByCycles:
-        """What they say of this graph."""
+        """The evidence and the cycles of a graph."""
         rank = vertex_ranks(stated)
         graph, turned = in_vertex_order(replace(stated, edges=rank[stated.edges]))
         evidence, cycles, point = gather(graph, options)
@@ -101,22 +103,22 @@ class _ByCycles:
 
     @property
     def by_chance(self) -> bool:
-        """Whether they say no more than chance would."""
+        """Whether cycles close no better than by chance: see `close_by_chance`."""
         known = self.evidence
         return close_by_chance(self.cycles, known.graph.i_from_j, known.noise, known.reach_m)
 
     @cached_property
     def fit(self) -> Solved:
-        """The solution that most edges agree with."""
+        """The solution that most edges agree with: see `find_consensus`."""
         return find_consensus(self.evidence)
 
     @cached_property
     def found(self) -> Diagnosis:
-        """The diagnosis that trusts no edge."""
+        """The diagnosis of that solution."""
         return self._diagnosis(self.fit)
 
     def sought_from(self, world_from_cam: Floats) -> Diagnosis:
-        """The same with the solution sought from these poses (V, 4, 4) too."""
+        """The diagnosis of the solution sought from poses (V, 4, 4) too."""
         in_order = world_from_cam[np.argsort(self.rank)] @ self.there
         return self._diagnosis(sought_from(self.evidence, self.fit, in_order))
 
@@ -125,36 +127,36 @@ class _ByCycles:
         agrees = agreeing(evidence, fit)
         cycles = _with_witnesses(self.cycles, fit.used, evidence)
         blame = share_blame(cycles, fit, evidence)
-        unvouched = blame.unvouched & (agrees >= LIKELIER_RIGHT)
-        untestable = evidence.in_no_listed_cycle | blame.undecided | unvouched
+        unconfirmed = blame.unconfirmed & (agrees >= LIKELIER_RIGHT)
+        untestable = evidence.in_no_listed_cycle | blame.undecided | unconfirmed
         probability = np.where(untestable, np.nan, np.maximum(agrees, blame.probability))
-        undecided = np.where(unvouched | (blame.probability > 0) | blame.undecided, blame.cycle, -1)
+        undecided = np.where(unconfirmed | (blame.probability > 0) | blame.undecided, blame.cycle, -1)
         right = (probability >= CONSISTENT_FROM) & fit.used
         wrong = probability < WRONG_BELOW
         verdict = np.select([untestable, right, wrong], [UNTESTABLE, CONSISTENT, WRONG], SUSPECT)
         kept = (verdict == CONSISTENT) | (verdict == UNTESTABLE)
         world_from_cam = fit.poses[self.rank] @ se3.inverse(there)
         cycles = replace(cycles, loops=cycles.loops.reversed_edges(self.turned))
-        telling = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
+        named_cycles = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
         found = Diagnosis.of(
             stated,
             verdict=verdict,
             probability=probability,
-            reasons=partial(reasons, stated, cycles, verdict, telling, undecided, fit.bridge),
+            reasons=partial(reasons, stated, cycles, verdict, named_cycles, undecided, fit.bridge),
             kept=kept,
             network=Network.of(stated.edges[kept], stated.vertex_count),
             cycles=cycles,
-            witnesses=telling,
+            witnesses=named_cycles,
             world_from_cam=world_from_cam,
             tested=f"cycles: {int(cycles.closes.sum())} of {len(cycles.loops)} close",
         )
-        information = _of_noise(evidence.noise, there, stated.dimension == 2)
+        information = _information(evidence.noise, there, stated.dimension == 2)
         notes = (*found.notes, *evidence.noise.doubts, *free_direction_notes(stated))
         return replace(found, information=information, notes=notes)
 
 
 def _with_witnesses(cycles: Cycles, used: Bools, evidence: Evidence) -> Cycles:
-    """The cycles, and more where none that closes passes an edge in use, though others in use close one over it."""
+    """The cycles, and cycles of used edges alone over each used edge that no listed cycle closes over."""
     wanted = used & (cycles.loops.sums_at_edges(cycles.closes, len(used)) == 0) & ~evidence.in_no_listed_cycle
     if not wanted.any():
         return cycles
@@ -162,8 +164,8 @@ def _with_witnesses(cycles: Cycles, used: Bools, evidence: Evidence) -> Cycles:
     return judge_cycles(loops, *cycle_errors(loops, evidence.graph.i_from_j), evidence.noise, evidence.reach_m)
 
 
-def _of_noise(noise: Noise, there: Floats, planar: bool) -> Floats:
-    """The information (E, 6, 6) of noise at the working point, in the axes and at the origin of the frames."""
+def _information(noise: Noise, there: Floats, planar: bool) -> Floats:
+    """The information (E, 6, 6) of noise at the working point, carried to the cameras' own frames."""
     carried = se3.adjoint(se3.inverse(there))
     information = carried.T @ noise.information @ carried
     if planar:

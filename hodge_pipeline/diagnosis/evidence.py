@@ -16,29 +16,29 @@ from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 FLOOR, CEILING = 0.05, 0.98
-"""Of a prior probability: what the order of the views says can be overruled."""
+"""Bounds of the prior probability by the order of views, so that cycles can overrule it."""
 FAR_SHARE = 0.25
 """Pairs further apart than this share of the vertices give the rate at which any two views are joined."""
 LEAST_ODDS = 2.0
-"""Of neighbours in order to be joined, in units of those of far pairs, for the order to count."""
+"""Least odds ratio of neighbours against far pairs to be joined, for the order to count."""
 DOUBTED = 2
-"""Neighbours that are counted as missing besides: of few views all may be joined by chance."""
+"""Unjoined neighbours that are added to those counted: of few views all may be joined by chance."""
 ROUNDS = 30
 """Of fixed-point iterations: a limit on cost."""
 FEW = 20
 """Edges of a gap at which the usual share of right edges weighs as much as their own."""
 TRIED_FROM = 0.1
-"""Share of the far pairs that are joined."""
+"""Share of far pairs that are joined, from which on all pairs are taken to have been tried."""
 CYCLES_PER_EDGE = 64
 """Triangles kept to an edge, so that memory is bounded."""
 LEAST_DEGREE = 4
-"""Mean number of edges at a view."""
+"""Least mean degree of a view where all pairs were tried."""
 FARTHEST = 2.0
-"""Of the median translation: a point further off is a turning circle, not something that is seen."""
+"""Largest distance of a working point in median translations: one farther off is the centre of a turn."""
 LEAST_GAIN = 0.3
 """Share of the median translation that a point must save."""
 TIE_BREAK = 1e-3
-"""Of a weight: with equal ones a chain would be joined one edge a round."""
+"""Random share added to a weight: with equal ones a chain would be merged one edge a round."""
 
 
 def order_prior(edges: Ints, vertex_count: int) -> Floats:
@@ -100,11 +100,11 @@ def right_by_gap(edges: Ints, vertex_count: int, cycles: Cycles, usual: float) -
     number = np.bincount(place, minlength=len(bounds))
     share = np.full(len(bounds), min(usual, CEILING))
     for _ in range(ROUNDS):
-        # of a cycle that fails at least one edge is wrong (expectation), and each in its share of them (maximisation)
+        # EM: in a failing cycle at least one edge is wrong; wrong edges are counted by gap
         close = np.exp(np.bincount(row, np.log(share)[entry], len(loops)))
         wrong = np.bincount(entry, ((1 - share)[entry] / (1 - close[row])), len(bounds))
         share = np.clip(1 - (wrong + 1 - usual) / (passes + 1), FLOOR, (number + 1) / (number + 2))
-    # few edges give a poor estimate for their gap: a doubtful edge would count as evidence against itself
+    # the estimate of a gap with few edges is poor: a doubtful edge would count against itself
     trust = number / (number + FEW)
     usual = float(np.clip(usual, FLOOR, CEILING))
     logit = trust * np.log(share / (1 - share)) + (1 - trust) * np.log(usual / (1 - usual))
@@ -120,7 +120,7 @@ def every_pair_tried(edges: Ints, vertex_count: int) -> bool:
 
 
 def _far_rate(simple: Ints, vertex_count: int) -> float:
-    """The share of far pairs that these (N, 2), each once and the lower first, are."""
+    """The share of all far pairs that are among the joined ones (N, 2), each once and the lower first."""
     start = max(int(np.ceil(FAR_SHARE * vertex_count)), 2)
     far = simple[:, 1] - simple[:, 0] >= start
     return float(far.sum() / max(_pairs(start, vertex_count, vertex_count), 1))
@@ -143,11 +143,11 @@ def _pairs(low: int, high: int, count: int) -> int:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Edges between frames at the working point, and what can be computed of them before any alignment.
+    """Edges between frames at the working point, and what is known of them before any alignment.
 
-    - `graph`: with the noise as information; `noise` of each edge; `reach_m`: how far overlapping views lie apart.
-    - `prior (E,)`: probability of being right by the order of the views; `support (E,)`: how many cycles close over
-      the edge, whose edges are likely right; `in_no_listed_cycle (E,)`.
+    - `graph`: with the noise as information; `noise` of each edge; `reach_m`: usual distance of overlapping views.
+    - `prior (E,)`: probability that an edge is right by the order of the views; `support (E,)`: cycles that close over
+      it, weighted by the prior of their other edges; `in_no_listed_cycle (E,)`.
     - `weight (E,)` of an edge's vote.
     - `exhaustive`: whether registration seems to have been tried on all pairs.
     """
@@ -162,13 +162,13 @@ class Evidence:
     exhaustive: bool
 
     def select(self, rows: Ints) -> Evidence:
-        """That of these edges among all vertices."""
+        """The evidence of these edges (rows), among all vertices."""
         edges = {name: getattr(self, name)[rows] for name in ("prior", "support", "in_no_listed_cycle", "weight")}
         return replace(self, graph=self.graph.select(rows), noise=self.noise.select(rows), **edges)
 
 
 def gather(graph: ViewGraph, options: DiagnosisOptions) -> tuple[Evidence, Cycles, Floats]:
-    """The evidence, the cycles that were listed, and the working point (3,) in the axes of each frame."""
+    """The evidence, the listed cycles, and the working point (3,) in the axes of each frame."""
     edges, count = graph.edges, graph.vertex_count
     prior = order_prior(edges, count) if options.order_prior else np.full(len(edges), 0.5)
     point, reach_m = working_point(graph.i_from_j, prior)
@@ -183,7 +183,7 @@ def gather(graph: ViewGraph, options: DiagnosisOptions) -> tuple[Evidence, Cycle
         noise = edge_noise(graph, there, loops, *errors, prior, reach_m)
         cycles = judge_cycles(loops, *errors, noise, reach_m)
     if not exhaustive:
-        # then the order cannot tell how many of the pairs that were tried are wrong: the cycles can
+        # the rate of joined pairs is no measure of wrong edges then; the cycles are
         usual = usual_share(cycles)
         prior = right_by_gap(edges, count, cycles, usual) if options.order_prior else np.minimum(prior, usual)
     support = closing_support(cycles, prior)
@@ -195,7 +195,7 @@ def gather(graph: ViewGraph, options: DiagnosisOptions) -> tuple[Evidence, Cycle
 
 
 def working_point(i_from_j: Floats, probability: Floats) -> tuple[Floats, float]:
-    """The point (3,) that likely edges move least, `Z c ≈ c`, and how far they move it (median).
+    """The point (3,) that likely edges move least, `Z c ≈ c`, and the median distance that they move it, metres.
 
     Overlapping views look at the same things, so that their motion nearly fixes a point in front of them. The origin
     where no point is clearly better.

@@ -1,9 +1,9 @@
 """Align a scene from its edges: pieces are merged greedily, those with the largest log-evidence first.
 
-Each round every piece picks the neighbour with the largest log-evidence and is merged with it (Borůvka's scheme for
-trees). Edges between two
-pieces are votes on where one lies in the other. Once joined, all edges of both vote together, so that long cycles are
-tested without ever being listed. No edge is trusted: one that agrees with no other is left out.
+Each round every piece picks the neighbour with the largest log-evidence and is merged with it (Borůvka's spanning
+tree). Edges between two pieces are votes on their relative pose. Once two pieces are merged, all edges of both vote
+together, so that long cycles are tested without being listed. No edge is trusted: one that agrees with no other is left
+out.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.types import Bools, Floats, Ints
 
 HYPOTHESES = 24
-"""Votes of a pair of pieces, the weightiest, that are tried as the answer."""
+"""Votes of a pair of pieces, those of most weight, that are tried as hypotheses."""
 MOST_COMPARED = 400
-"""Votes of a pair of pieces that each of those tried is compared with: a limit on cost."""
+"""Votes of a pair of pieces that each hypothesis is compared with: a limit on cost."""
 PER_FOLD = 2.0
-"""Nats that agreeing edges between two sets of views add per e-fold of their number: they are one event, since places
-that look alike give many wrong edges that agree."""
+"""Log-evidence, in nats per e-fold of their number, of edges between two sets of views that agree: not proportional to
+it, since places that look alike give many wrong edges that agree.
+"""
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Alignment:
 
 
 def align(evidence: Evidence, start: Alignment | None = None) -> Alignment:
-    """The alignment that the edges' weights lead to, from vertices on their own or from the pieces of a start."""
+    """The alignment by greedy merging, of single vertices or of the pieces of a start."""
     count, weight = evidence.graph.vertex_count, evidence.weight
     piece, poses = np.arange(count), np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
     if start is not None:
@@ -70,7 +71,7 @@ def _gains(evidence: Evidence, votes: Votes) -> Floats:
 
 
 def _joins(votes: Votes, gain: Floats, count: int) -> tuple[Ints, Bools]:
-    """The hypotheses to join by, and whether it is the lower of the two pieces that moves.
+    """The hypotheses (rows) to merge pieces by, and whether the piece of lower number moves.
 
     A piece moves to the one with the largest log-evidence, if that one stays where it is in this round.
     """
@@ -95,12 +96,12 @@ def _joins(votes: Votes, gain: Floats, count: int) -> tuple[Ints, Bools]:
 
 @dataclass(frozen=True)
 class Votes:
-    """Votes sorted by the pair of pieces that they join, weightiest first; hypotheses are some of them.
+    """Edges between pieces as votes on relative poses, sorted by pair of pieces and then by weight.
 
-    - `edge (N,)`, `low_from_high (N, 4, 4)`: where the edge puts the piece of higher number; `point (N, 3)`: the end
-      of the edge in that piece.
-    - `pair (N,)`: row of the pair of pieces; `low`, `high (P,)`: their numbers; `start (P,)`: its first vote.
-    - `hypothesis`, `vote (M,)`: rows that were compared; `agreement (M,)` from 1 down to 0 at the gate.
+    - `edge (N,)`; `low_from_high (N, 4, 4)`: the relative pose of the pieces by the edge; `point (N, 3)`: the end of
+      the edge in the piece of higher number, in that piece's frame.
+    - `pair (N,)`: row of the pair of pieces; `low`, `high (P,)`: their numbers; `start (P,)`: first vote of each pair.
+    - `hypothesis`, `vote (M,)`: rows that were compared; `agreement (M,)`: 1 where equal, down to 0 at the gate.
     """
 
     edge: Ints
@@ -148,8 +149,8 @@ def _compared(pair: Ints, start: Ints, count: Ints) -> tuple[Ints, Ints]:
 
 
 def agreement_of(evidence: Evidence, edge: Ints, motion: Floats, point: Floats, first: Ints, second: Ints) -> Floats:
-    """How well pairs (M,) of votes (N,) agree, from 1 down to 0 at the gate: rows `first` and `second` of the edges,
-    their motions (N, 4, 4) and the points (N, 3) that these move.
+    """How well votes `first` and `second` (M,) agree: max(0, 1 − χ² / gate); by `edge (N,)`, `motion (N, 4, 4)` and
+    `point (N, 3)`, that the motion acts on, of each vote.
     """
     quat = se3.to_quat_xyzw(motion)
     angle = 2 * np.arccos(np.minimum(1.0, np.abs(np.einsum("ni,ni->n", quat[first], quat[second]))))
@@ -175,8 +176,8 @@ def agreed_motions(votes: Votes, chosen: Ints, weight: Floats) -> Floats:
 
 
 def mean_motions(group: Ints, motion: Floats, point: Floats, share: Floats, count: int) -> Floats:
-    """The mean (count, 4, 4) of the motions (n, 4, 4) of each group (n,) by where they bring their points (n, 3), each
-    counting its share (n,).
+    """Weighted means (count, 4, 4) of the motions (n, 4, 4) of each group (n,): the chordal mean of rotations, and the
+    translation that fits where the motions take their points (n, 3); `share (n,)` are the weights.
     """
     share = share / np.bincount(group, share, count)[group]
     to_group = csr_matrix((share, (group, np.arange(len(group)))), shape=(count, len(group)))

@@ -14,39 +14,39 @@ from hodge_pipeline.complex.judging import MEDIAN_CHI2, has_unit_information, me
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 DEFAULT_ANGLE_RAD, DEFAULT_SHARE = 0.03, 0.05
-"""An edge's errors where too few cycles close to estimate them, that of translation of its usual length."""
+"""Standard deviations of an edge where too few cycles close to estimate them; of translation as a share of the reach.
+"""
 ABOUT_A_POINT = 0.2
-"""Of the usual step between views, where they all turn about one point, at which nothing moves."""
+"""Least reach as a share of the usual step between views: where all turn about one point, nothing moves there."""
 FIRST_GATE_RAD, FIRST_GATE_SHARE = 0.35, 0.6
-"""To which cycles may close that errors are estimated from, translation as a share of the reach."""
+"""Gates of cycles that errors are estimated from; of translation as a share of the reach."""
 LONGEST_CYCLE = 4
-"""Edges of those: errors of longer ones add up until any cycle seems to close."""
+"""Most edges of those: errors of longer cycles add up until any seems to close."""
 FEWEST_CYCLES, SOME_CYCLES = 20, 4
-"""That must close to estimate errors, and that show how large they may be where fewer do."""
+"""Fewest closing cycles to estimate errors from, and fewest cycles to bound them where fewer close."""
 COPIES = 1e-5
-"""Of the gate: cycles that close so exactly join copies of one measurement, and are no evidence."""
+"""Share of the gate below which cycles join copies of one measurement and are no evidence."""
 STATED = 3.0
-"""Standard deviations of the graph's own information that explain a cycle."""
+"""Closing error, in standard deviations by the stated information, up to which this explains a cycle."""
 NEARLY_ALL = 0.95
-"""Of the cycles that close: if the stated information explains so many, errors are as large as it takes."""
+"""Share of closing cycles: if the stated information explains so many, errors are scaled to cover as many."""
 MAXWELL_MEDIAN, MAXWELL_NEARLY_ALL = math.sqrt(MEDIAN_CHI2[3]), math.sqrt(chdtri(3, 1 - NEARLY_ALL))
 """Quantiles of the length of a vector of three normal errors."""
 GAP = 5.0
-"""Of the error that nearly all cycles that close stay below."""
+"""Factor on the error that `NEARLY_ALL` closing cycles stay below, beyond which cycles are apart from these."""
 HEAVY_TAILS = 1.9
-"""Errors of registration have heavier tails than a Gaussian of the same median."""
-LEAST_CREDIBLE, MOST_CREDIBLE, TOLD_FROM = 0.2, 2.5, 2.0
-"""Of the default error: the bounds within which a stated error is believed; and the factor of correction from which
-a note reports it.
-"""
+"""Factor on a Gaussian's standard deviation of the same median: errors of registration have heavier tails."""
+LEAST_CREDIBLE, MOST_CREDIBLE, NOTED_FROM = 0.2, 2.5, 2.0
+"""Bounds of a credible stated error in units of the default; and the correction from which a note reports it."""
 LEVER = 1.8
-"""Of the reach: how far around the working point lies what is seen, which an error of rotation moves along."""
+"""Radius of what is seen about the working point, in reaches, at which an error of rotation acts as one of translation.
+"""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations to an axis (E,) of each edge, radians and metres at the working point; and notes on
-    stated information that was not believed.
+    """Standard deviations per axis (E,) of each edge, radians and metres at the working point; `doubts`: notes on
+    stated information that is not credible.
     """
 
     rotation_rad: Floats
@@ -62,7 +62,7 @@ class Noise:
         return out
 
     def select(self, rows: Ints | Bools) -> Noise:
-        """That of these edges."""
+        """The noise of these edges."""
         return Noise(self.rotation_rad[rows], self.translation_m[rows], self.doubts)
 
 
@@ -75,13 +75,11 @@ def edge_noise(
     prior: Floats,
     reach_m: float,
 ) -> Noise:
-    """The noise of each edge: the information `there`, of the graph at the working point, gives the proportions, and
-    cycles that close give the scale.
+    """The noise of each edge: proportions by the information `there`, at the working point, scale by closing cycles.
 
-    Where the information explains nearly all of these, the scale does so too: edges of several kinds make long tails,
-    and their stated information fits the cycles. Where too few cycles close to estimate it, the information is believed
-    within bounds: errors as large as the motions would let any loop close, and errors as small as those of rounding
-    none.
+    Where the stated information explains nearly all closing cycles, the scale covers them too, since edges of several
+    kinds make long tails. Where too few cycles close to estimate a scale, stated errors are clipped to credible bounds:
+    with errors as large as motions any loop would close, with errors as small as rounding none.
     """
     informed, ones = not has_unit_information(graph), np.ones(graph.edge_count)
     own = [_deviation(each) for each in mean_variances(there, graph.dimension == 2)] if informed else [ones, ones]
@@ -91,18 +89,18 @@ def edge_noise(
     turned, shifted = _Errors(loops, rotation, angle[short]), _Errors(loops, translation, displacement_m[short])
     usual = DEFAULT_ANGLE_RAD, DEFAULT_SHARE * max(reach_m, ABOUT_A_POINT * _usual_step(graph))
     stated = usual if not informed else (_median(rotation), _median(translation))
-    believed = tuple(map(_credible, stated, usual, (turned.shown(), shifted.shown())))
-    turn = turned.scale(FIRST_GATE_RAD, prior, believed[0] if informed else usual[0])
-    shift = shifted.scale(FIRST_GATE_SHARE * reach_m, prior, believed[1] if informed else usual[1])
+    credible = tuple(map(_credible, stated, usual, (turned.median_scale(), shifted.median_scale())))
+    turn = turned.scale(FIRST_GATE_RAD, prior, credible[0] if informed else usual[0])
+    shift = shifted.scale(FIRST_GATE_SHARE * reach_m, prior, credible[1] if informed else usual[1])
     closes = (turned.error < FIRST_GATE_RAD) & (shifted.error < FIRST_GATE_SHARE * reach_m)
     sound = (turned.ratio < STATED) & (shifted.ratio < STATED)
     if informed and closes.sum() >= FEWEST_CYCLES and sound[closes].mean() >= NEARLY_ALL:
-        turn = max(turn, turned.scale_of_nearly(sound, closes))
-        shift = max(shift, shifted.scale_of_nearly(sound, closes))
+        turn = max(turn, turned.covering_scale(sound, closes))
+        shift = max(shift, shifted.covering_scale(sound, closes))
     if not informed:
         shift = max(shift, LEVER * turn * reach_m)
-    taken = turn == believed[0], shift == believed[1]
-    changed = any(own and not 1 / TOLD_FROM < by < TOLD_FROM for own, by in zip(taken, believed, strict=True))
+    taken = turn == credible[0], shift == credible[1]
+    changed = any(own and not 1 / NOTED_FROM < by < NOTED_FROM for own, by in zip(taken, credible, strict=True))
     is_reported = informed and changed and any_cycle
     doubts = (_doubt(stated, (turn * stated[0], shift * stated[1])),) if is_reported else ()
     return Noise(_scaled(turn, rotation, own[0]), _scaled(shift, translation, own[1]), doubts)
@@ -124,10 +122,10 @@ def _median(deviation: Floats) -> float:
     return float(np.median(deviation)) if len(deviation) else 1.0
 
 
-def _credible(stated: float, usual: float, shown: float) -> float:
-    """The factor that makes a stated error credible beside a usual one and what the cycles show; 1 where it is."""
+def _credible(stated: float, usual: float, median_scale: float) -> float:
+    """The factor that makes a stated error credible beside a `usual` one and one `shown` by cycles; 1 if it is."""
     if stated > MOST_CREDIBLE * usual:
-        return min(max(usual / stated, shown), 1.0)
+        return min(max(usual / stated, median_scale), 1.0)
     return max(1.0, LEAST_CREDIBLE * usual / stated)
 
 
@@ -144,20 +142,21 @@ def _deviation(variance: Floats) -> Floats:
 
 
 def _proportions(stated: Floats) -> Floats:
-    """Standard deviations (E,) within the square root of ten of the usual one, which an edge that states none has."""
+    """Standard deviations (E,), clipped to √10 times the median either way; infinite ones become the median."""
     usual = float(np.median(stated[np.isfinite(stated)])) if np.isfinite(stated).any() else 1.0
     return np.clip(np.where(np.isfinite(stated), stated, usual), usual / math.sqrt(10), usual * math.sqrt(10))
 
 
 def _scaled(scale: float, proportions: Floats, stated: Floats) -> Floats:
-    """Errors (E,) by their scale. One that shrinks them leaves an edge what it states itself, up to the usual error:
-    odometry and loops often state theirs in different units, and the scale is that of the loops.
+    """Scaled standard deviations (E,), but none below the stated one, or the median one if that is less.
+
+    Odometry and loops often state errors in different units, and the scale is that of the loops.
     """
     return np.maximum(scale * proportions, np.minimum(stated, scale * _median(proportions)))
 
 
 class _Errors:
-    """The `error (L,)` of short cycles, and its `ratio (L,)` to what the proportions of their edges make of it."""
+    """Closing errors of short cycles, `error (L,)`, and their `ratio (L,)` to those by the edges' relative noise."""
 
     def __init__(self, loops: Loops, relative: Floats, error: Floats) -> None:
         self.loops, self.error = loops, error
@@ -174,16 +173,16 @@ class _Errors:
         median = float(self.ratio[closes][order][np.searchsorted(total, total[-1] / 2)])
         return max(HEAVY_TAILS * median / MAXWELL_MEDIAN, 1e-3 * fallback)
 
-    def shown(self) -> float:
-        """The scale that explains half of all cycles, if these are some: more than half of few are hardly wrong."""
+    def median_scale(self) -> float:
+        """The scale by the median of all cycles, 0 of fewer than `SOME_CYCLES`: hardly half of a few are wrong."""
         if len(self.ratio) < SOME_CYCLES:
             return 0.0
         return HEAVY_TAILS * float(np.median(self.ratio)) / MAXWELL_MEDIAN
 
-    def scale_of_nearly(self, sound: Bools, closes: Bools) -> float:
-        """The scale that explains nearly all cycles that the information does (L,), unless a gap parts them from those
+    def covering_scale(self, sound: Bools, closes: Bools) -> float:
+        """The scale that covers nearly all cycles that the information explains, `sound (L,)`, up to a gap after those
         that close (L,): stated errors that are far too large would explain wrong edges too.
         """
-        told = self.ratio[closes & (self.ratio > COPIES)]
-        limit = GAP * float(np.quantile(told, NEARLY_ALL)) if len(told) else np.inf
+        ratios = self.ratio[closes & (self.ratio > COPIES)]
+        limit = GAP * float(np.quantile(ratios, NEARLY_ALL)) if len(ratios) else np.inf
         return float(np.quantile(self.ratio[sound & (self.ratio < limit)], NEARLY_ALL)) / MAXWELL_NEARLY_ALL

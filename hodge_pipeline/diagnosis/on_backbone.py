@@ -27,15 +27,13 @@ from hodge_pipeline.solvers.resistance import Network
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 MOST_ENTRIES = 500_000
-"""Edges of all cycles that are listed, the shortest first."""
+"""Most edges of all listed cycles together, of which the shortest are listed: a limit on memory."""
 RIGHT_STEP = 0.99
-"""The probability of a step that confirmed loops pass over; what could be wrong with it, they would show, so that the
-other probability is that of a step which they call wrong.
-"""
+"""The probability of a step that confirmed loops pass over; of a broken or contradicted step 1 − this."""
 
 
 def judged_on_backbone(graph: ViewGraph, backbone: Backbone) -> Diagnosis:
-    """The verdicts that follow from a backbone; its own edges are kept, but for steps that are broken."""
+    """The diagnosis by a backbone, whose steps are kept unless broken or contradicted."""
     kept = backbone.used
     in_loop = np.zeros(graph.edge_count, bool)
     in_loop[np.flatnonzero(kept)] = series_classes(graph.edges[kept], graph.vertex_count) >= 0
@@ -64,8 +62,9 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone) -> Diagnosis:
 
 
 def _cycles(graph: ViewGraph, backbone: Backbone, in_loop: Bools) -> tuple[Cycles, Ints]:
-    """The cycle of each loop with the steps that it spans, and the row of each edge's (E,): of the shortest loops, and
-    of those whose steps confirmed loops pass over, since no step is to blame for a loop that fails alone.
+    """The cycle of each loop with the steps that it spans, and the row (E,) of the cycle of each loop, −1 for none.
+
+    Listed are the shortest loops all of whose steps are in use and in a cycle of used edges.
     """
     chain = backbone.chain
     low, high = chain.ends.T
@@ -87,7 +86,7 @@ def _cycles(graph: ViewGraph, backbone: Backbone, in_loop: Bools) -> tuple[Cycle
 
 
 def _around(graph: ViewGraph, chain: Chain, chords: Ints, low: Ints, high: Ints, onward: Bools) -> Loops:
-    """Each of these loops (K,), from `low` to `high`, or back where it is not `onward`, and the steps that it spans."""
+    """The cycles of loops (K,), from `low` to `high`, or back where not `onward`, with the steps that they span."""
     offsets = np.concatenate([[0], np.cumsum(high - low + 1)])
     row = np.repeat(np.arange(len(chords)), high - low + 1)
     nth = np.arange(len(row)) - offsets[row]
@@ -100,13 +99,13 @@ def _around(graph: ViewGraph, chain: Chain, chords: Ints, low: Ints, high: Ints,
 def _reasons(
     edges: Ints, backbone: Backbone, verdict: NDArray[np.str_], residual: tuple[Floats, Floats]
 ) -> tuple[str, ...]:
-    """One line for each edge: who confirms it, and how far it is from the poses."""
+    """One line for each edge: what confirms or contradicts it, and its residual at the poses."""
     over = _passed_over(edges, backbone)
     others = int(backbone.loops_used.sum())
     lines = []
     for edge, name in enumerate(verdict.tolist()):
         if backbone.steps[edge] and name != WRONG:
-            # those over a bridge between two paths pass over their ends too, which lie in no cycle
+            # loops over a bridge between two paths also pass over steps that lie in no cycle
             some = over[edge] > 0 and name != UNTESTABLE
             passed = f"{over[edge]} confirmed loops pass over it" if some else "no confirmed loop passes over it"
             lines.append(f"an edge of the backbone: {passed}")
@@ -119,13 +118,13 @@ def _reasons(
         elif backbone.used[edge]:
             lines.append(f"it agrees with the backbone and {others - 1} other loops: {away}")
         elif name == UNTESTABLE and edges[edge, 0] == edges[edge, 1]:
-            lines.append("it joins a vertex to itself: it says nothing of the others")
+            lines.append("it joins a vertex to itself and constrains no other")
         elif name == UNTESTABLE:
             lines.append("it joins two paths of the backbone that nothing else joins: nothing can test it")
         elif not others:
             lines.append(f"nothing confirms it, nor any other loop: {away}, which are the backbone's")
         else:
-            fails = "it contradicts" if name == WRONG else "too little speaks for it beside"
+            fails = "it contradicts" if name == WRONG else "the evidence for it is too weak beside"
             lines.append(f"{fails} the backbone and {others} confirmed loops: {away}")
     return tuple(lines)
 
@@ -136,5 +135,5 @@ def _passed_over(edges: Ints, backbone: Backbone) -> Ints:
     ends = chain.ends[backbone.loops_used & (chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]])]
     over, steps = chain.over(ends), np.flatnonzero(chain.step_edge >= 0)
     out[chain.step_edge[steps]] = over[steps]
-    out[backbone.part] = over[chain.spans(edges[backbone.part])[:, 1]]
+    out[backbone.merged] = over[chain.spans(edges[backbone.merged])[:, 1]]
     return out

@@ -1,12 +1,12 @@
-"""Log-evidence for where views are: sums over the pairs of views that the cut between two sets of them separates.
+"""Log-evidence for the relative placement of two sets of views: a function of sums over the pairs that a cut separates.
 
-A whole arrangement of views is worth what greedy merges of them are, the two sets whose placement has the largest
-log-evidence first, each counted as one cut. So a hundred wrong edges that agree weigh little more than ten right ones,
-as they do when a single set of views is moved. The log-evidence of each camera's orientation is added.
+The log-evidence of a whole arrangement is the sum over greedy merges, the two sets with the largest log-evidence first,
+each one cut. So a hundred wrong edges that agree weigh little more than ten right ones, as when a single set is moved.
+The log-evidence of each camera's upright orientation is added.
 
 Edges that agree on one placement are one event, since places that look alike give many wrong edges that agree: they
-count by the logarithm of their number. Where every pair was tried, a scene model tells more: evidence against a
-placement are pairs of views that it makes overlap and that have no edge, and consecutive views are near each other.
+count by the logarithm of their number. Where every pair was tried, a scene model adds evidence: pairs of views that
+would overlap and have no edge are against a placement, consecutive views near each other for it.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from hodge_pipeline.diagnosis.scene_model import SceneModel
 from hodge_pipeline.types import Bools, Floats, Ints
 
 FAIR_SHARE, SHARE_SPREAD = 0.75, 0.35
-"""Of the edges expected under a placement, the share from which on it has evidence in its favour, and its spread."""
+"""Share of the expected edges at which a placement has no evidence either way, and the deviation for full evidence."""
 ROUNDING = 1e-9
-"""Of a trace."""
+"""Tolerance on the trace of a rotation."""
 JUMP = 1e-4
-"""Share of consecutive views that do not see the same place."""
+"""Probability that consecutive views do not see the same place."""
 UNSUPPORTED, SUPPORTED = 0.05, 0.3
 """Closing cycles over an edge: added to each count, and the count that leaves the odds unchanged."""
 
 
 def log_evidence(sums: Floats) -> Floats:
-    """Log-evidence for cuts with these sums (3, ...) of their layers."""
+    """Log-evidence (...,) for cuts by the sums (3, ...) of their layers: see `Placements.layers`."""
     agreeing, expected, order = sums
     share = np.clip((agreeing / np.maximum(expected, 1e-9) - FAIR_SHARE) / SHARE_SPREAD, -1, 1)
     return np.asarray(PER_FOLD * np.log1p(agreeing) + share * np.log1p(expected) + order)
@@ -43,11 +43,11 @@ def log_evidence(sums: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Placements:
-    """What speaks for a solution, and for moving some of its views.
+    """Evidence for a solution, and for moving some of its views.
 
     - `model`: the probability of edges by poses, and the distribution of up, where every pair was tried; else None.
-    - `pairs (P, 2)`: of views, the first of which stays where the second moves: all of them with a model, else those
-      that have an edge; `row (2 E,)`: the pair of each edge whose second end moves, and then whose first.
+    - `pairs (P, 2)`: directed pairs of views, of which the second moves: all with a model, else those with an edge.
+    - `row (2 E,)`: the pair of each edge whose second end moves, then of each whose first end moves.
     """
 
     evidence: Evidence
@@ -58,7 +58,7 @@ class Placements:
 
     @classmethod
     def of(cls, evidence: Evidence, found: Solved, model: SceneModel | None) -> Placements:
-        """Those of a solution."""
+        """The placements of a solution."""
         count, edges = evidence.graph.vertex_count, evidence.graph.edges
         directed = np.concatenate([edges, edges[:, ::-1]])
         if model is None:
@@ -67,7 +67,7 @@ class Placements:
         return cls(evidence, found, model, pairs, directed @ [count, 1])
 
     @cached_property
-    def now(self) -> Floats:
+    def current_layers(self) -> Floats:
         """The layers (3, P) of the solution, of pairs in one piece."""
         first, second = self.pairs.T
         together = (self.found.piece[first] == self.found.piece[second]) & (first != second)
@@ -83,14 +83,16 @@ class Placements:
 
     @cached_property
     def proposed(self) -> Floats:
-        """The rotation of the world (2 E, 9) that makes each edge agree when its second end moves, then its first."""
+        """Rotations of the world (2 E, 9), flattened, that make each edge agree when its second end moves, then its
+        first.
+        """
         rotations, (i, j) = self.found.poses[:, :3, :3], self.evidence.graph.edges.T
         second = rotations[i] @ self.evidence.graph.i_from_j[:, :3, :3] @ np.swapaxes(rotations[j], 1, 2)
         return np.concatenate([second, np.swapaxes(second, 1, 2)]).reshape(-1, 9)
 
     def layers(self, motion: Floats) -> Floats:
-        """For each motion (K, 4, 4) and pair (K, 3, P), its second view moved: whether an edge agrees (from 1 down to
-        0), the probability that one would, and the log-evidence of their order.
+        """The layers (K, 3, P) of all pairs for motions (K, 4, 4) of the second view: how well its edge agrees (0 to
+        1), the probability of an edge there, and the log-evidence of consecutive views.
         """
         poses = self.found.poses
         moved = motion[:, None] @ poses
@@ -101,22 +103,22 @@ class Placements:
             expected = each.reshape(len(poses), *moved.shape[:2]).swapaxes(0, 1).reshape(agreeing.shape)
         if self.usual:
             next_to = np.abs(self.pairs[:, 1] - self.pairs[:, 0]) == 1
-            order = self.sure * agreeing
+            order = self.consecutive * agreeing
             order[:, next_to] += np.log(JUMP + (1 - JUMP) * expected[:, next_to] / self.usual)
         return np.stack([agreeing, expected, order], axis=1)
 
     @cached_property
-    def sure(self) -> Floats:
-        """The log-evidence (P,) of the edge that joins consecutive views; 0 of other pairs."""
+    def consecutive(self) -> Floats:
+        """The log-evidence (P,) of edges between consecutive views; 0 for other pairs."""
         edges, out = self.evidence.graph.edges, np.zeros(len(self.pairs))
         rows = np.flatnonzero(np.abs(edges[:, 1] - edges[:, 0]) == 1)
-        sure = consecutive_log_evidence(self.evidence)[rows]
-        np.maximum.at(out, self.row.reshape(2, -1)[:, rows].ravel(), np.tile(sure, 2))
+        consecutive = consecutive_log_evidence(self.evidence)[rows]
+        np.maximum.at(out, self.row.reshape(2, -1)[:, rows].ravel(), np.tile(consecutive, 2))
         return out
 
     def _agreeing(self, motion: Floats, moved: Floats) -> Floats:
-        """From 1 down to 0 (K, P) how well the edge of each pair agrees, the first view still, the second `moved
-        (K, V, 4, 4)`.
+        """How well (K, P) the edge of each pair agrees, 0 to 1: the first view in place, the second `moved (K, V, 4,
+        4)`.
         """
         edges, poses, noise = self.evidence.graph.edges, self.found.poses, self.evidence.noise
         widest = np.minimum(np.sqrt(UNSETTLED) * noise.rotation_rad, np.pi)
@@ -142,12 +144,12 @@ class Placements:
         return self.model.upright.world_up(self.found.poses[:, :3, :3], self.found.piece)
 
     def held(self, rotations: Floats, up: Floats) -> Floats:
-        """Log-evidence (V,) of how cameras are held, which are turned so (V, 3, 3), where up is (V, 3)."""
+        """Upright log-evidence (V,) of camera rotations (V, 3, 3) where up is (V, 3); 0 without a model."""
         return self.model.upright.log_evidence(rotations, up) if self.model else np.zeros(len(rotations))
 
 
 def consecutive_log_evidence(evidence: Evidence) -> Floats:
-    """Log-evidence of each edge (E,) if it joins consecutive views: by its prior odds, and by the cycles over it."""
+    """Log-evidence (E,) of each edge, if it joins consecutive views, by its prior odds and closing cycles."""
     odds = evidence.prior / (1 - evidence.prior) * (evidence.support + UNSUPPORTED) / SUPPORTED
     return np.asarray(np.log1p(odds))
 
@@ -157,14 +159,14 @@ def arrangement_log_evidence(evidence: Evidence, found: Solved, model: SceneMode
     here, count = Placements.of(evidence, found, model), len(found.piece)
     together = found.piece[:, None] == found.piece[None]
     np.fill_diagonal(together, False)
-    layers = here.now.reshape(3, count, count)
+    layers = here.current_layers.reshape(3, count, count)
     held = here.held(found.poses[:, :3, :3], here.up)
     return float(held.sum()) + _merged((layers + layers.swapaxes(1, 2)) / 2, together)
 
 
 def _merged(sums: Floats, possible: Bools) -> float:
-    """Log-evidence summed over greedy merges, the strongest of the `possible (V, V)` ones first; `sums (3, V, V)` of
-    the layers between any two sets are added up on the way.
+    """Log-evidence summed over greedy merges of views, the largest first; `sums (3, V, V)`: layers of all pairs, which
+    merges add up; `possible (V, V)`: pairs of one piece.
     """
     count, total = sums.shape[1], 0.0
     value = np.where(possible, log_evidence(sums), -np.inf)

@@ -67,8 +67,8 @@ class Diagnosis:
         world_from_cam: Floats,
         tested: str,
     ) -> Diagnosis:
-        """The diagnosis of these verdicts: its pieces are those of the kept edges; `reasons` of the residuals (E,) in
-        metres and degrees; `tested`: a note on what tested the edges.
+        """The diagnosis with these verdicts, whose pieces are those of the kept edges; `reasons` makes the lines from
+        residuals (E,), metres and degrees; `tested`: a note on what tested the edges.
         """
         piece = network.component
         apart = piece[graph.edges[:, 0]] != piece[graph.edges[:, 1]]
@@ -76,8 +76,8 @@ class Diagnosis:
         residual = np.where(apart, np.nan, displacement_m), np.where(apart, np.nan, np.degrees(angle))
         leverage = np.where(kept, 1 - 1 / (1 + effective_resistance(graph.edges, kept, network)), 0.0)
         notes = f"edges: {count_verdicts(verdict)}", tested, *describe_components(piece, graph.vertex_ids)
-        told = verdict, probability, reasons(residual), kept, *residual, leverage, graph.information, cycles
-        return cls(*told, *witnesses, network.component, world_from_cam, network, notes)
+        columns = verdict, probability, reasons(residual), kept, *residual, leverage, graph.information, cycles
+        return cls(*columns, *witnesses, network.component, world_from_cam, network, notes)
 
     def __repr__(self) -> str:
         return f"Diagnosis({len(self.verdict)} edges: {count_verdicts(self.verdict)})"

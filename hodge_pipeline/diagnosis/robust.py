@@ -28,7 +28,7 @@ from hodge_pipeline.types import Bools, Floats, Solution, ViewGraph
 from hodge_pipeline.types.text import counted
 
 SIGMAS = 3.0
-"""Standard deviations of χ², √(2 degrees of freedom), by which it may exceed these where stated errors explain it."""
+"""Standard deviations, √(2 degrees of freedom), by which χ² may exceed its mean where stated errors explain it."""
 Solver: TypeAlias = Callable[[ViewGraph, Floats], Solution]
 """The maximum-likelihood solution of a graph, from poses (V, 4, 4)."""
 
@@ -42,14 +42,13 @@ def solve_robust(
     dimension: Literal[2, 3] | None = None,
     certificate: bool = False,
 ) -> Solution:
-    """The poses of the edges that agree, with `weights` 0 for the others and from 0 to 1 for those.
+    """The poses of the edges that the diagnosis keeps; `weights (E,)` are from 0 to 1 for these and 0 for the others.
 
-    `diagnosis`: how the edges are judged first, and which of them are trusted as a backbone. Where there is one, the
-    loops that it and each other confirm are kept. Where the information explains what the kept edges leave over, the
-    poses are the maximum-likelihood ones of these; else an edge that is kept weighs by Student's t what it leaves over,
-    and nothing beyond the gate of `student_weight`. The graph's fixed vertices stay at their start. The components are
-    those of the edges that are kept. `confirmed` is False where edges are left out and the cycles of those kept close
-    no better than by chance.
+    `diagnosis`: how the edges are judged, and which are trusted as a backbone. Where the information explains the
+    residuals of the kept edges, the poses are their maximum-likelihood ones; else kept edges have weights by Student's
+    t, 0 beyond the gate of `student_weight`. The graph's fixed vertices stay at their start. Components are those of
+    the kept edges. `confirmed` is False where edges are left out and the cycles of the others close no better than by
+    chance.
     """
     check_choice("objective", objective, ObjectiveName)
     start = None if start is None else np.asarray(start, float)
@@ -68,15 +67,16 @@ def solve_robust(
             certificate=certificate,
         )
 
-    final = _judged(graph, found, solved) if isinstance(found, Diagnosis) else _on_backbone(graph, found, solved)
+    final = (
+        _without_backbone(graph, found, solved) if isinstance(found, Diagnosis) else _on_backbone(graph, found, solved)
+    )
     metrics = {**final.metrics, "kept_edges": float((final.weights > 0).sum())}
     return replace(final, notes=(*unheld, *final.notes), metrics=metrics)
 
 
 def _on_backbone(graph: ViewGraph, backbone: Backbone, solved: Solver) -> Solution:
-    """The poses of a backbone and the loops that it confirms, with the information where it states something of every
-    axis and explains what these leave over, else with the errors that they were found to have; `confirmed` is None
-    where no loop is.
+    """The poses of a backbone and its confirmed loops: by the information, where it constrains every axis and explains
+    the residuals, else by the learned errors; `confirmed` is None where no loop is.
     """
     chosen = graph.select(np.flatnonzero(backbone.used))
     final = solved(chosen, backbone.world_from_cam) if backbone.chain.stated else None
@@ -91,52 +91,52 @@ def _on_backbone(graph: ViewGraph, backbone: Backbone, solved: Solver) -> Soluti
     )
 
 
-def _judged(graph: ViewGraph, found: Diagnosis, solved: Solver) -> Solution:
+def _without_backbone(graph: ViewGraph, found: Diagnosis, solved: Solver) -> Solution:
     """The poses of the edges that a diagnosis without a backbone keeps."""
-    known = replace(graph, information=found.information) if has_unit_information(graph) else graph
+    informed = replace(graph, information=found.information) if has_unit_information(graph) else graph
     stated = edge_weights(graph, dimension_of(graph))
     kept = found.kept & stated.used
 
-    def weighed(weights: Floats, poses: Floats) -> Solution:
+    def solved_with(weights: Floats, poses: Floats) -> Solution:
         rows = np.flatnonzero(weights)
-        chosen = known.select(rows)
+        chosen = informed.select(rows)
         return solved(replace(chosen, information=weights[rows, None, None] * chosen.information), poses)
 
     weights = kept.astype(float)
-    final = weighed(weights, found.world_from_cam)
+    final = solved_with(weights, found.world_from_cam)
     if not is_explained(graph.select(np.flatnonzero(kept)), final):
-        weights, final = reweighted(known, weights, final, weighed)
+        weights, final = reweighted(informed, weights, final, solved_with)
     whole = np.zeros(graph.edge_count)
     whole[np.flatnonzero(weights)] = final.weights * weights[np.flatnonzero(weights)]
-    told = (note for note in stated.notes if note not in final.notes)
-    notes = (*told, _told(found, whole), *found.notes, *final.notes)
+    stated_notes = (note for note in stated.notes if note not in final.notes)
+    notes = (*stated_notes, _kept_note(found, whole), *found.notes, *final.notes)
     return _with_confirmation(graph, stated.used, replace(final, weights=whole, notes=notes))
 
 
 def is_explained(graph: ViewGraph, solution: Solution) -> bool:
-    """Whether the χ² of a maximum-likelihood solution of all edges of a graph is no more than the graph's information
-    has chance make of it; False where the information is the identity that stands for unknown.
+    """Whether the χ² of the maximum-likelihood solution of all edges agrees with its degrees of freedom; False where
+    the information is the identity that stands for unknown.
     """
     if has_unit_information(graph):
         return False
     axes = 3 if dimension_of(graph) == 2 else 6
-    known = np.zeros(0, np.int64) if graph.priors is None else graph.priors.vertices
-    free = np.ones(int(solution.component.max(initial=-1)) + 1, np.int64)  # poses to choose, one of each component
-    free[solution.component[known]] = 0
+    informed = np.zeros(0, np.int64) if graph.priors is None else graph.priors.vertices
+    free = np.ones(int(solution.component.max(initial=-1)) + 1, np.int64)  # gauge: one pose of each component
+    free[solution.component[informed]] = 0
     held = np.maximum(np.bincount(solution.component[graph.fixed], minlength=len(free)), free).sum()
-    freedom = axes * int(graph.edge_count + len(known) - graph.vertex_count + held)
+    freedom = axes * int(graph.edge_count + len(informed) - graph.vertex_count + held)
     return freedom <= 0 or solution.metrics["objective"] <= freedom + SIGMAS * math.sqrt(2 * freedom)
 
 
 def _placed(graph: ViewGraph, poses: Floats, start: Floats | None) -> Floats:
-    """The poses (V, 4, 4), the first vertex of each component where it starts, without a start at the origin."""
+    """The poses (V, 4, 4), the first vertex of each component moved to its start, by default the identity."""
     component = connected_components(graph.edges, graph.vertex_count)
     first = np.unique(component, return_index=True)[1]
     start = np.broadcast_to(np.eye(4), poses.shape) if start is None else start
     return np.asarray((start[first] @ se3.inverse(poses[first]))[component] @ poses)
 
 
-def _told(found: Diagnosis, weights: Floats) -> str:
+def _kept_note(found: Diagnosis, weights: Floats) -> str:
     out = weights == 0
     reasons = found.verdict == WRONG, found.verdict == SUSPECT, found.kept
     wrong, suspect, more = (int((out & reason).sum()) for reason in reasons)
@@ -149,7 +149,7 @@ def _told(found: Diagnosis, weights: Floats) -> str:
 def _with_confirmation(graph: ViewGraph, usable: Bools, solution: Solution) -> Solution:
     """The solution with `confirmed` set: whether cycles of its used edges close better than by chance.
 
-    Edges that no solve can use (not `usable`, (E,)) are none that the judgement left out.
+    Edges that no solve can use (not `usable (E,)`) do not count as left out.
     """
     weights = solution.weights[usable]
     if closes_better_than_chance(graph.select(np.flatnonzero(usable)), np.flatnonzero(weights)):

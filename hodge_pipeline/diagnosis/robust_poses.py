@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.judging import FREEDOM, STUDENT_99, left_over, squares_at_both_ends, tail_weight
+from hodge_pipeline.complex.judging import FREEDOM, STUDENT_99, residual_twists, squares_at_both_ends, tail_weight
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import Alignment
 from hodge_pipeline.solvers.minimise import descend_isotropic
@@ -18,26 +18,28 @@ from hodge_pipeline.solvers.setup import InitialName, prepare
 from hodge_pipeline.types import Bools, Floats, Ints
 
 GATE, UNSETTLED = STUDENT_99[6], 60.0
-"""An edge of a larger χ² has no part in the poses, the second while these are not settled."""
+"""χ² gates of edges for a solve: the final one, and one for poses that are not yet final."""
 ONCE, TWICE = (UNSETTLED,), (UNSETTLED, GATE)
 ANNEALED = (1e4, 1e3, 300.0)
-"""Gates for poses that drifted while they grew: edges that they miss by far pull them into place (graduated
-non-convexity, Yang et al. 2020), and what does not follow falls out.
+"""Decreasing gates for poses that drifted in growth: edges far off pull them into place before they are dropped
+(graduated non-convexity, Yang et al. 2020).
 """
 DIMENSION = 6
-"""Of a pose."""
+"""Degrees of freedom of an edge."""
 ROUNDS = 4
-"""Of weights in a solve."""
+"""Reweighting rounds of a solve."""
 FULLY, QUICKLY = Limits(20, 1e-6), Limits(6, 1e-4)
-"""What ends the steps in each: of a rough solve, or of a large graph's, sooner."""
+"""Step limits and tolerances of a round: `QUICKLY` for wide gates and large graphs."""
 LARGE = 20_000
-"""From so many edges on, a solve is stopped early: verdicts need millimetres less than seconds."""
+"""Number of edges beyond which solves are stopped early: verdicts do not need millimetres."""
 
 
 @dataclass(frozen=True)
 class Solved(Alignment):
-    """Solved poses (V, 4, 4) at the working point, the piece (V,) of each, the χ² (E,) of every edge, allowing for
-    the uncertainty of the poses (∞ between pieces), the edges that are used (E,), and the resistance (E,).
+    """Solved poses at the working point, and each edge judged by them.
+
+    `chi2 (E,)`: allowing for the uncertainty of the poses, ∞ between pieces; `used (E,)`: within the gate;
+    `resistance (E,)`: effective resistance between the ends without the edge, ∞ for a bridge.
     """
 
     chi2: Floats
@@ -51,13 +53,13 @@ class Solved(Alignment):
 
 
 def fit(evidence: Evidence, alignment: Alignment, gates: tuple[float, ...], initial: InitialName = "given") -> Solved:
-    """The robust solution that an alignment leads to: for each gate in turn, the edges of a smaller χ² are solved.
+    """The robust solution from an alignment: for each gate in turn, the edges of smaller χ² are solved.
 
-    For gates wider than GATE quickly and with errors as large as the gate allows, which leads near it whatever the
-    drift. `initial`: the poses that each solve begins at, the alignment's or chordal ones of the edges of its gate.
+    With gates wider than `GATE` few steps are made, and noise is scaled up to the gate, so that drift does not matter.
+    `initial`: what each solve starts from, the poses before it or chordal ones of the edges within its gate.
     """
     apart = np.not_equal(*alignment.piece[evidence.graph.edges.T])
-    found = _judged(evidence, alignment.poses, alignment.piece, ~apart, 0.0)
+    found = _with_chi2(evidence, alignment.poses, alignment.piece, ~apart, 0.0)
     for gate, following in zip(gates, (*gates[1:], GATE if gates[-1] > GATE else math.inf), strict=True):
         used = found.chi2 < gate
         if following < gate and np.array_equal(used, found.chi2 < following):
@@ -67,11 +69,11 @@ def fit(evidence: Evidence, alignment: Alignment, gates: tuple[float, ...], init
         limits = QUICKLY if rough or len(used) > LARGE else FULLY
         poses, squares = _solve(evidence, found.poses, used, first, limits, widened, initial)
         piece = connected_components(evidence.graph.edges[used], evidence.graph.vertex_count)
-        found = _judged(evidence, poses, piece, used, np.where(used, FREEDOM / (FREEDOM + squares), 0.0))
+        found = _with_chi2(evidence, poses, piece, used, np.where(used, FREEDOM / (FREEDOM + squares), 0.0))
     return found
 
 
-def _judged(evidence: Evidence, poses: Floats, piece: Ints, used: Bools, student_weight: Floats | float) -> Solved:
+def _with_chi2(evidence: Evidence, poses: Floats, piece: Ints, used: Bools, student_weight: Floats | float) -> Solved:
     network = Network.of(evidence.graph.edges[used], evidence.graph.vertex_count)
     resistance = effective_resistance(evidence.graph.edges, used, network)
     chi2 = chi2_at(evidence, poses, piece, resistance, student_weight)
@@ -87,8 +89,8 @@ def _solve(
     widened: float,
     initial: InitialName,
 ) -> tuple[Floats, Floats]:
-    """The poses (V, 4, 4) that the used edges (E,) lead to, weighed by Student's t, at first for χ² of `squares (E,)`;
-    and the χ² (E,) by the noise of the edges alone.
+    """The poses (V, 4, 4) of the used edges (E,), reweighted by Student's t, at first for χ² `squares (E,)`; and the χ²
+    (E,) by the noise of the edges alone, divided by `widened`.
 
     `widened`: how much larger than noise squared errors may be.
     """
@@ -107,14 +109,14 @@ def _solve(
 def chi2_at(
     evidence: Evidence, poses: Floats, piece: Ints, resistance: Floats, student_weight: Floats | float = 0.0
 ) -> Floats:
-    """χ² (E,) in the edge's noise and the poses' own: angles drift as a random walk, positions with them; ∞ between
-    pieces (V,).
+    """χ² (E,) by the noise of the edge and of the poses, whose rotations drift as a random walk and move positions; ∞
+    between pieces (V,).
 
     `resistance (E,)`: see `Network.between`; 0 where the poses are exact. For an edge that was used with
     `student_weight (E,)` the χ² is what it would be at poses solved without it.
     """
     graph = evidence.graph
-    turned, shifted = squares_at_both_ends(graph.i_from_j, left_over(graph, poses))
+    turned, shifted = squares_at_both_ends(graph.i_from_j, residual_twists(graph, poses))
     finite_resistance = np.where(np.isfinite(resistance), resistance, 0.0)
     turn, shift = evidence.noise.rotation_rad**2, evidence.noise.translation_m**2
     swing = turn * evidence.reach_m**2 * finite_resistance**3 / 3

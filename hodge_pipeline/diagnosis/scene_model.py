@@ -21,15 +21,15 @@ from hodge_pipeline.diagnosis.robust_poses import Solved
 from hodge_pipeline.types import Bools, Floats, Ints
 
 CEILING = 0.97
-"""Even views that lie upon each other are not always joined."""
+"""Probability that two views at one pose are joined."""
 USUAL, SPREAD = np.array([6.0, np.log(2.5), np.log(2.7)]), np.array([2.0, 0.5, 0.5])
 """The means of the prior on the parameters of `Joining`, and their standard deviations."""
 LEAST_SPREAD_RAD = 0.2
-"""Poses drift: chained edges are not upright to less, however the cameras were."""
+"""Least spread of up: chained poses drift by as much, however upright the cameras were."""
 FEWEST = 6
-"""Views of a group that the model is fitted to: with fewer, the unknown up of the group fits too well."""
+"""Fewest views of a group that the model is fitted to: the unknown up of a smaller one fits too well."""
 ROUNDS, STEPS = 8, 5
-"""Of the fit, and of the up of each group: limits on cost."""
+"""Iterations of the fit, and of the up of each group: limits on cost."""
 CLEAR_SHARE, CLEAR_SPREAD_RAD = 0.8, 0.42
 """The least share and the largest spread of a model that is used; else its share becomes 0."""
 STARTS = np.concatenate([np.eye(3), np.array([[0, 1, 1], [0, -1, 1]]) / np.sqrt(2)])

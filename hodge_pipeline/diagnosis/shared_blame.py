@@ -15,33 +15,33 @@ from hodge_pipeline.types import Bools, Floats, Ints
 
 @dataclass(frozen=True)
 class SharedBlame:
-    """Where an alignment had to leave out one of several edges that no cycle tells apart.
+    """Where an alignment had to leave out one of several edges that no cycle distinguishes.
 
-    - `unvouched (E,)`: edges in use because another one was left out, and either may be the wrong one: those that the
-      same cycles pass as that one, and the only connections between two parts, over which no cycle closes.
-    - `cycle (E,)`: the shortest failing cycle of each such edge, of each that was left out for it, and of each that is
-      undecided; −1 elsewhere.
-    - `probability (E,)`: of being right, of an edge left out that shares the blame: by its prior among those it shares
-      it with, of which one is wrong; 0 elsewhere.
+    - `unconfirmed (E,)`: used edges that may be wrong in place of one left out: edges in series with it, and bridges
+      over which no cycle closes.
+    - `cycle (E,)`: the shortest failing cycle of each unconfirmed or undecided edge, and of each edge left out in place
+      of one; −1 elsewhere.
+    - `probability (E,)`: that an edge left out in place of another is right, by the prior odds of the edges of its
+      cycle, of which one is wrong; 0 elsewhere.
     - `undecided (E,)`: edges whose only test is one failing cycle.
     """
 
-    unvouched: Bools
+    unconfirmed: Bools
     cycle: Ints
     probability: Floats
     undecided: Bools
 
 
 def share_blame(cycles: Cycles, fit: Solved, evidence: Evidence) -> SharedBlame:
-    """Who shares the blame, in this alignment."""
+    """The edges that share the blame in a solution."""
     loops, count = cycles.loops, len(evidence.graph.edges)
-    untold = (loops.sums_at_edges(cycles.closes, count) == 0) & ~evidence.in_no_listed_cycle
+    never_closes = (loops.sums_at_edges(cycles.closes, count) == 0) & ~evidence.in_no_listed_cycle
     classes = series_classes(evidence.graph.edges, evidence.graph.vertex_count)
     doubted = _in_series_with(~fit.used, classes)
-    unvouched = fit.used & ((np.isinf(fit.resistance) & untold) | doubted)
-    # an edge that was left out shares the blame where each of its cycles has an edge that no closing cycle confirms
-    vouched = loops.sums(unvouched) == 0
-    left_out = ~fit.used & ((untold & (loops.sums_at_edges(vouched, count) == 0)) | doubted)
+    unconfirmed = fit.used & ((np.isinf(fit.resistance) & never_closes) | doubted)
+    # an edge that was left out shares the blame where each of its cycles has an unconfirmed edge
+    all_confirmed = loops.sums(unconfirmed) == 0
+    left_out = ~fit.used & ((never_closes & (loops.sums_at_edges(all_confirmed, count) == 0)) | doubted)
     # of edges in series all of which one cycle passes, no other cycle passes any
     of_one_class = classes[loops.edge] == classes[loops.edge[loops.offsets[loops.rows]]]
     alone = np.bincount(loops.rows, of_one_class, len(loops)) == loops.lengths
@@ -49,17 +49,17 @@ def share_blame(cycles: Cycles, fit: Solved, evidence: Evidence) -> SharedBlame:
     cycle = np.full(count, -1, np.int64)
     longest_first = np.argsort(-loops.lengths[loops.rows], kind="stable")
     cycle[loops.edge[longest_first]] = loops.rows[longest_first]  # of an edge in several the last, shortest, stays
-    cycle[~(unvouched | left_out | undecided)] = -1
+    cycle[~(unconfirmed | left_out | undecided)] = -1
     odds = (1 - evidence.prior) / evidence.prior
-    among = loops.sums(np.where(unvouched | left_out, odds, 0.0))
+    among = loops.sums(np.where(unconfirmed | left_out, odds, 0.0))
     probability = np.zeros(count)
     named = left_out & (cycle >= 0)  # of a large graph the longest cycles are not listed
     probability[named] = 1 - odds[named] / among[cycle[named]]
-    return SharedBlame(unvouched, cycle, probability, undecided)
+    return SharedBlame(unconfirmed, cycle, probability, undecided)
 
 
 def _in_series_with(chosen: Bools, classes: Ints) -> Bools:
-    """Edges (E,) that the same cycles pass as another one, where one of these is chosen (E,)."""
+    """Edges (E,) of series classes of two or more of which one is chosen (E,)."""
     names = np.where(classes >= 0, classes, len(classes) + np.arange(len(classes)))  # a bridge is in series with none
     place, size = np.unique(names, return_inverse=True, return_counts=True)[1:]
     place = place.reshape(-1)

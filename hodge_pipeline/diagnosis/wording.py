@@ -11,11 +11,11 @@ from hodge_pipeline.diagnosis.result import CONSISTENT, UNTESTABLE
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 LONGEST_NAMED = 12
-"""Vertices of a cycle whose names are all said."""
+"""Most vertices of a cycle that are all named."""
 ROUNDING = 1e-9
-"""Metres and degrees that are said to be none."""
+"""Metres and degrees that are printed as 0."""
 MOST_NAMED = 4
-"""Edges that share a blame; of more the number."""
+"""Most edges sharing the blame that are all named; else their number is."""
 TOO_LONG = "every loop through it is too long to be listed: nothing tests it"
 
 
@@ -77,7 +77,7 @@ def _in_loop(graph: ViewGraph, wanted: Bools) -> Bools:
 
 
 def _sound(cycles: Cycles, kept: Bools) -> Ints:
-    """How many cycles (E,) close over an edge of which all other edges are kept."""
+    """How many cycles (E,) close over each edge and have only kept edges beside it."""
     loops = cycles.loops
     others = loops.sums(~kept)[loops.rows] - ~kept[loops.edge]
     return np.bincount(loops.edge, cycles.closes[loops.rows] & (others == 0), len(kept)).astype(np.int64)
@@ -93,7 +93,7 @@ def _against(is_bridge: bool, away: str) -> str:
     """Evidence against an edge none of whose cycles fails."""
     if is_bridge:
         return "it alone holds two parts together, which edges that were left out would join otherwise"
-    return f"against it speaks where all kept edges together lay its ends: {away}"
+    return f"all kept edges together place its ends elsewhere: {away}"
 
 
 def _undecided(graph: ViewGraph, cycles: Cycles, row: int, doubted: Bools) -> str:

@@ -1,4 +1,4 @@
-"""What every edge builder shares: which frames can have an edge, and their proposals as one."""
+"""Common to edge builders: which frames can have an edge, and the union of several proposals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def usable_rows(clouds: CloudSet, world_from_cam: Floats | None = None) -> Ints:
 
 
 def has_reason(candidates: Edges, reason: str) -> Bools:
-    """Where (P,) this reason is among those of a pair."""
+    """Which pairs (P,) have this reason."""
     labels, which = np.unique(candidates.proposed_by, return_inverse=True)
     return np.array([reason in label.split("+") for label in labels], bool)[which]
 

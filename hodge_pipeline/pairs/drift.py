@@ -14,8 +14,9 @@ from hodge_pipeline.pairs.overlap import pairwise_iou
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints
 
 DRIFT_SHARE = 0.05
-"""Of the length of the path, where a turn counts as the distance by which the scene moves: odometry of RGB-D frames
-drifts by 1 to 5 %, of lidar by less."""
+"""Drift as a share of the path, where a turn counts as the arc at the scene: odometry of RGB-D frames drifts by 1 to 5
+%, of lidar by less.
+"""
 OCTAVES = 8
 SAMPLED_FRAMES = 50
 NOTHING = np.zeros((0, 2), np.int64)
@@ -104,6 +105,6 @@ def displacement_m(motions: Floats, range_m: float) -> Floats:
 
 
 def median_range_m(clouds: CloudSet, rows: Ints) -> float:
-    """How far what these rows see is from their cameras; 1 where none sees anything."""
+    """The median distance of points from their cameras, metres, of a sample of these rows; 1 where there are none."""
     some = rows[:: max(1, len(rows) // SAMPLED_FRAMES)].tolist()
     return float(np.median([np.median(np.linalg.norm(clouds[row].points_in_cam, axis=1)) for row in some] or [1.0]))

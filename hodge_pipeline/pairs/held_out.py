@@ -1,4 +1,4 @@
-"""Edges kept out of the solve, by which its result is judged."""
+"""Held-out edges, by which the result of a solve is judged."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from hodge_pipeline.types.edges import HELD_OUT
 HASH_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 """Odd constants of a multiplicative hash: the draw depends on a pair's frames and the seed alone."""
 FEWEST = 15
-"""Pairs, at least, where there are enough: one or two would judge nothing."""
+"""Fewest held-out pairs, where there are enough."""
 LARGEST_SHARE = 0.3
-"""Of the pairs: the solve needs the rest."""
+"""Largest share of the pairs that is held out."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

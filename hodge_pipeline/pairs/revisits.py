@@ -1,7 +1,7 @@
-"""Loops closed along the path: where the camera comes back to a place, its clouds are registered to those of before.
+"""Loop closures along the path: where the camera revisits a place, its clouds are registered to those of before.
 
-Odometry drifts, but a camera that comes back along places it knows is off by what it drifted since the last of them
-alone. So the path is followed once, and each place found again puts what follows where the path was before.
+A camera that revisits known places is off only by its drift since the last of them. So the path is followed once, and
+each loop closure corrects the poses after it.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from hodge_pipeline.stages import Advance, Registrar, no_progress
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Registration
 
 REVISIT = "revisit"
-"""Why a pair is proposed."""
+"""The reason in `proposed_by`."""
 LOOP_RANGES = 4.0
-"""Median ranges of the path, a turn as the arc at that range, between two views that close a loop: two thirds of a full
-turn. Nearer ones the edge builders find."""
+"""Least length of the path between two views that close a loop, in median ranges, a turn as the arc at that range: two
+thirds of a full turn. Nearer ones are found by edge builders."""
 REACH_RANGES = 2.0
 """Median ranges, a turn as above, beyond which two views share too little."""
 VIEWS_APART, COMPARED = 3, 12
-"""Key frames between those of before that a view is compared with, whose motions err apart, and how many: the
-nearest."""
+"""Least number of key frames between the earlier views that a view is compared with, so that their errors are
+independent; and how many, the nearest."""
 DRIFT_SHARE = 0.03
-"""Of the path since the last place known, what odometry may be off by."""
+"""Bound on drift as a share of the path since the last loop closure."""
 VOXEL_RANGES = 0.1
-"""Median ranges: the least side of the voxels in which two views share space, .2 m in a room."""
+"""Least side, in median ranges, of the voxels in which overlap is measured: .2 m in a room."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
@@ -77,15 +77,15 @@ def find_revisits(
 ) -> Edges:
     """The pairs that close loops, registered, from poses (K, 4, 4) in the order of the path; `advance` counts poses.
 
-    Between two parts (K,) odometry says nothing, and no loop is looked for. A view is believed to be at a place of
-    before where two views there put it at the same spot, no farther off than odometry drifts along the shortest way of
-    steps and loops between them. The loops that are `known` come first.
+    No loop is looked for between two parts (K,), as no odometry joins them. A loop closure is accepted where two
+    earlier views place a view alike, within the drift along the shortest path of steps and loops between them. The
+    `known` loops come first.
     """
     return _Path(clouds, world_from_cam, part, options, known or Edges.of(np.zeros((0, 2), np.int64))).found(advance)
 
 
 class _Path:
-    """The path so far: its poses as the loops found put them, and the ways between its views."""
+    """The path so far: its poses as corrected by loops, and the lengths of steps between its views."""
 
     def __init__(self, clouds: CloudSet, world_from_cam: Floats, part: Ints, options: Revisits, known: Edges) -> None:
         assert clouds.folder is not None
@@ -122,7 +122,7 @@ class _Path:
         return np.asarray(self._poses[row - 1] @ self._steps[row - 1])
 
     def _candidates(self, row: int) -> tuple[Ints, Floats]:
-        """The two views of before that share most with this one, and how far off each may be, metres."""
+        """The two earlier views that overlap most with this one, and how far off each may be, metres."""
         options = self._options
         before = int(np.searchsorted(self._at_m, self._at_m[row] - LOOP_RANGES * self._range_m))
         way_m = self._ways(row, options.longest_way_m)[:before]
@@ -138,7 +138,7 @@ class _Path:
         return best, allowed_m[best]
 
     def _shared(self, one: int, other: int, drift_m: float) -> float:
-        """The share of the space of two views that both see, in voxels that forgive so much drift."""
+        """The IoU of the voxels of two views, as wide as the drift."""
         voxel_m = max(VOXEL_RANGES * self._range_m, drift_m)
         origin = np.floor(self._poses[one, :3, 3] / voxel_m).astype(np.int64)
         a, b = (
@@ -149,7 +149,7 @@ class _Path:
         return common / max(len(a) + len(b) - common, 1)
 
     def _ways(self, row: int, limit_m: float) -> Floats:
-        """The shortest way (row + 1,) by steps and loops from a view to each one before it; infinite beyond a limit."""
+        """The shortest path (row + 1,) by steps and loops from a view to each before it, metres; ∞ beyond the limit."""
         i, j = np.arange(row), np.arange(1, row + 1)
         loops = np.array([loop[:2] for loop in self._loops], np.int64).reshape(-1, 2)
         loops = np.concatenate([loops, self._known.pairs[self._known.pairs[:, 1] <= row]])
@@ -172,7 +172,7 @@ class _Path:
         self._poses[row] = places[0]
 
     def _register(self, target: int, source: int, allowed_m: float) -> Registration | None:
-        """The view of before with this one, None where they do not fit within what is allowed."""
+        """The earlier view `target` registered with `source`; None where fitness or correction fail their limits."""
         guess = se3.inverse(self._poses[target]) @ self._poses[source]
         found = self._options.registration.register(self._prepared[target], self._prepared[source], guess)
         moved_m = self._far(se3.inverse(guess) @ found.i_from_j)

@@ -18,7 +18,7 @@ from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.errors import GraphError, SourceError
 from hodge_pipeline.pairs.edits import joining
 from hodge_pipeline.recipe.recipe_file import recipe_names
-from hodge_pipeline.solvers.backbone.chain import believed, sequential_edges
+from hodge_pipeline.solvers.backbone.chain import credible_steps, sequential_edges
 from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.setup import InitialName
@@ -162,7 +162,7 @@ def solve_file(path: Path, choices: Choices) -> SolvedFile:
         graph = replace(graph, information=graph.information * np.outer(SESYNC_UNITS, SESYNC_UNITS))
     cpu_s, wall_s = time.process_time(), time.monotonic()
     solution = _solved(graph, start, choices)
-    if not choices.robust and not believed(graph, sequential_edges(graph))[1]:
+    if not choices.robust and not credible_steps(graph, sequential_edges(graph))[1]:
         solution = replace(solution, notes=(UNTOLD, *solution.notes))
     cpu_s, wall_s = time.process_time() - cpu_s, time.monotonic() - wall_s
     weights = np.zeros(len(off))

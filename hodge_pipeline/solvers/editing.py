@@ -16,7 +16,7 @@ from hodge_pipeline.complex.components import connected_components, describe_com
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.full_information import FullObjective
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName
-from hodge_pipeline.solvers.minimise import descend_isotropic, full_objective, here, metrics_of, minimise
+from hodge_pipeline.solvers.minimise import at_start, descend_isotropic, full_objective, metrics_of, minimise
 from hodge_pipeline.solvers.newton import Descent, Limits, descend, still_to_come
 from hodge_pipeline.solvers.priors import PER_EDGE
 from hodge_pipeline.solvers.problem import make_problem
@@ -26,19 +26,19 @@ from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
 LIMITS = Limits(max_iterations=100, relative_tolerance=1e-9)
 
 SHARE = 10
-"""One free vertex in so many moves at most."""
+"""Divides the number of free vertices: the most that a local solve moves."""
 FEWEST = 500
-"""Below it the whole graph is solved as fast."""
+"""Fewest vertices of a local solve: below, the whole graph is solved as fast."""
 GROWTH, GROWTHS = 4, 2
-"""The neighbourhood's, from the smallest on."""
+"""Factor and number of growths of the neighbourhood, from the smallest on."""
 LEAST_SHARE = 0.25
-"""Of what one growth wins, that the next one is expected to win: what is far decays slowly."""
+"""Least share of the gain of one growth that the next is expected to gain: influence decays slowly with distance."""
 
 
 @dataclass(frozen=True)
 class _State:
-    """What `undo` comes back to: the edges, their weights relative to their information, the latest solution, and by
-    how much its objective may yet fall where poses far from the edits were left as they are.
+    """A state for `undo`: the edges, their weights relative to their information, the latest solution, and `owed`, by
+    how much its objective may yet fall since poses far from the edits were not solved for.
     """
 
     graph: ViewGraph
@@ -181,7 +181,7 @@ class GraphEditor:
         everywhere = len(moved) < np.count_nonzero(changed)
         near, to_come = (setup, math.inf) if everywhere else settled_nearby(setup, moved, limits, full)
         owed = self._state.owed + to_come
-        descent = here(near, full)
+        descent = at_start(near, full)
         if owed > LIMITS.relative_tolerance * descent.point.cost:
             descent = minimise(near, "given", limits, full)
             owed = 0.0 if descent.converged else math.inf
@@ -231,8 +231,8 @@ class GraphEditor:
 
 
 def settled_nearby(setup: Setup, changed: Ints, limits: Limits, full: bool) -> tuple[Setup, float]:
-    """The set-up with start poses that are at their best near the changed edges (rows of the problem's), and what the
-    poses farther off may still win: foretold from what the neighbourhood won as it grew.
+    """The set-up with start poses optimised near the changed edges (rows of the problem), and by how much the objective
+    may still fall farther off, extrapolated from the gains of growing neighbourhoods.
     """
     most = setup.problem.free_count // SHARE
     if not len(changed):
@@ -247,7 +247,7 @@ def settled_nearby(setup: Setup, changed: Ints, limits: Limits, full: bool) -> t
 
 
 def _settled(setup: Setup, moving: Ints, poses: tuple[Floats, Floats], limits: Limits, full: bool) -> Descent:
-    """The descent of the poses of some vertices, written to where the others are."""
+    """The descent of the poses of the `moving` vertices alone, which are overwritten in `poses`."""
     problem, (rotations, translations) = setup.problem, poses
     inside = np.zeros(problem.count, bool)
     inside[moving] = True

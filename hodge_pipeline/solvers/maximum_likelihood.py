@@ -19,7 +19,7 @@ from hodge_pipeline.one_blas_thread import one_blas_thread
 from hodge_pipeline.solvers.backends import BackendName
 from hodge_pipeline.solvers.certificate import Certificate, bounded, certify
 from hodge_pipeline.solvers.escape import escape
-from hodge_pipeline.solvers.minimise import here, metrics_of, minimise
+from hodge_pipeline.solvers.minimise import at_start, metrics_of, minimise
 from hodge_pipeline.solvers.newton import ROUNDING_REACHED, Limits, Point
 from hodge_pipeline.solvers.priors import with_world, without_world
 from hodge_pipeline.solvers.reweighted import reweighted
@@ -113,7 +113,7 @@ def solve(
     descent = minimise(setup, initial, limits, full, watch)
     metrics = metrics_of(descent, full)
     if start is not None:
-        metrics["objective_at_start"] = here(setup, full).point.cost
+        metrics["objective_at_start"] = at_start(setup, full).point.cost
     certified: bool | None = None
     if certificate and full:
         notes.append("only the isotropic objective can be certified")

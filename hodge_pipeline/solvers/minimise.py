@@ -28,20 +28,20 @@ from hodge_pipeline.types import Floats, Ints
 
 Watch: TypeAlias = Callable[[Point], None]
 WARM_START_TOLERANCE = 1e-5
-"""The isotropic optimum starts the full objective: nearer than this they differ anyway."""
+"""Relative tolerance of the isotropic optimum that starts the full objective, from which it differs by more."""
 
-AS_PROMISED = 0.95
-"""Of what a full step should win: near the minimum, within .02 rad and .05 m, it wins .997 to 1.01 of it on five graphs
-of the literature, from their odometry .09 to .88.
+LEAST_GAIN_RATIO = 0.95
+"""Least ratio of actual to predicted decrease of a full step: near the minimum, within .02 rad and .05 m, it wins .997
+to 1.01 of it on five graphs of the literature, from their odometry .09 to .88.
 """
 
 NEAR_RAD = 0.01
-"""So near half a turn an edge pulls with a hundredth of its weight: the square, 1e-4, is what a step wins, and the
-first steps of a descent stop for no more than that.
+"""Distance from half a turn at which an edge pulls with a hundredth of its weight: a step then gains the square, 1e-4,
+for less than which a descent stops.
 """
 MOST_CG_STEPS, CG_TOLERANCE = 200, 1e-3
 TURNS_RAD = math.pi * 0.5 ** np.arange(6)
-"""How far the edges are turned back, each tried both ways: the way down is narrow where others are nearly as stiff."""
+"""Turns that are tried, in either direction: the descent direction is narrow where other edges are nearly as stiff."""
 
 
 def minimise(
@@ -51,8 +51,10 @@ def minimise(
     full: bool,
     watch: Watch | None = None,
 ) -> Descent:
-    """The descent of the isotropic objective and, where `full`, of the full one from its end: of this alone where CG is
-    not tried for the isotropic one, and from given poses where its first step wins what it promises.
+    """The descent of the isotropic objective and, where `full`, of the full one from its end.
+
+    The full one is descended alone where its steps are factorisations, and from given poses where its first step gains
+    `LEAST_GAIN_RATIO` of the predicted decrease. Minima at which edges miss by half a turn are left: see `turned_back`.
     """
     begin = setup.initial(initial)
     found = _minimum(setup, begin, limits, full, watch, at_once=initial == "given")
@@ -75,12 +77,10 @@ def _minimum(
     watch: Watch | None,
     at_once: bool,
 ) -> Descent:
-    """The descent from there, which may end at a saddle: where `full`, `at_once` of the full objective, unless its
-    first step wins too little.
-    """
-    direct = full_at_once(setup.problem)
-    if full and (at_once or direct):
-        objective, least_won = full_objective(setup), 0.0 if direct else AS_PROMISED
+    """The descent from `begin`, which may end at a saddle; `at_once`: try the full objective first, where `full`."""
+    alone = full_at_once(setup.problem)
+    if full and (at_once or alone):
+        objective, least_won = full_objective(setup), 0.0 if alone else LEAST_GAIN_RATIO
         found = descend(objective, objective.at(*begin), limits, setup.rounding, watch, least_won=least_won)
         if found.reason != FAR_FROM_MINIMUM:
             return found
@@ -132,8 +132,8 @@ def full_objective(setup: Setup) -> FullObjective:
     return FullObjective.of(setup.problem, information if used.all() else information[used])
 
 
-def here(setup: Setup, full: bool) -> Descent:
-    """The descent that stays at the given poses, for their cost."""
+def at_start(setup: Setup, full: bool) -> Descent:
+    """A descent of no steps, for the cost at the given poses."""
     rotations, translations = setup.initial("given")
     if full:
         cost = full_objective(setup).at(rotations, translations).cost
@@ -153,7 +153,7 @@ def metrics_of(descent: Descent, full: bool) -> dict[str, float]:
 
 
 def turned_back(problem: Problem, rotations: Floats, translations: Floats) -> tuple[Floats, Floats] | None:
-    """Poses of a lower F, where edges that miss by half a turn make a saddle of these; None where there are none.
+    """Poses of a lower F, where edges that miss by half a turn make a saddle of the given ones; else None.
 
     Rotations (n, d, d) and translations (n, d), in the problem's order. They are moved along the negative curvature
     that conjugate gradients meet when these edges alone pull (Steihaug 1983), turned by up to half a turn.
@@ -178,7 +178,7 @@ def _half_turned(problem: Problem, rotations: Floats) -> Ints:
 
 
 def _downhill(problem: Problem, here: IsotropicPoint, edges: Ints) -> Floats | None:
-    """Of negative curvature (free · p,), the edges turning by 1 at the most; None where F only rises."""
+    """A direction of negative curvature (free · p,), scaled so that no edge turns by more than 1; else None."""
     p = problem.tangent_size
     axis = np.ones((len(edges), 1)) if p == 1 else se3.so3_log(here.left.turn[edges])
     pull = np.zeros((problem.count, p))
@@ -193,7 +193,7 @@ def _downhill(problem: Problem, here: IsotropicPoint, edges: Ints) -> Floats | N
     found = truncated_cg(hessian, precondition, pull[:free].reshape(-1), CG_TOLERANCE, MOST_CG_STEPS)
     if found.downhill is None:
         return None
-    way = np.zeros((problem.count, p))
-    way[:free] = found.downhill.reshape(free, p)
-    turned = np.linalg.norm(way[problem.head[edges]] - way[problem.tail[edges]], axis=1).max()
+    direction = np.zeros((problem.count, p))
+    direction[:free] = found.downhill.reshape(free, p)
+    turned = np.linalg.norm(direction[problem.head[edges]] - direction[problem.tail[edges]], axis=1).max()
     return found.downhill / turned if turned > 0 else None

@@ -38,7 +38,7 @@ class Network:
 
     @cached_property
     def factor(self) -> Factor:
-        """Of their Laplacian without the grounded vertices."""
+        """The factor of the Laplacian without the grounded vertices."""
         return factorise(grounded_laplacian(self.d0, np.ones(self.d0.shape[0]), self.grounded))
 
     @property
@@ -79,8 +79,8 @@ class Network:
 
 
 def effective_resistance(edges: Ints, used: Bools, network: Network) -> Floats:
-    """The resistance (E,) between the ends of each edge through the other ones that are used, whose network it is: ∞
-    for bridges and for them alone. Estimates leave the others at least the share by which they may err.
+    """The resistance (E,) between the ends of each edge through the other used edges: ∞ for bridges, and where no used
+    edges join the ends. `network`: of the used edges. Estimated resistances are bounded by their error.
     """
     own = np.flatnonzero(used & (edges[:, 0] != edges[:, 1]))
     out = network.between(edges)

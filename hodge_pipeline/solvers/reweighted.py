@@ -1,4 +1,4 @@
-"""Maximum-likelihood poses with heavy-tailed errors: each edge weighs by Student's t what it leaves over."""
+"""Iteratively reweighted least squares: weights of edges by Student's t, from their residuals."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hodge_pipeline.solvers.weights import dimension_of
 from hodge_pipeline.types import Floats, Solution, ViewGraph
 
 ROUNDS, SETTLED = 4, 1e-2
-"""Rounds of weights at most, and the change of them that ends the rounds: beyond, no edge goes or comes."""
+"""Most rounds, and the largest change of a weight that ends them: less moves no edge in or out."""
 
 
 def reweighted(

@@ -22,7 +22,7 @@ from hodge_pipeline.types import Floats, Ints, ViewGraph
 InitialName: TypeAlias = Literal["chordal", "given"]
 DimensionName: TypeAlias = Literal[2, 3, None]
 ROUNDING = 1e-22
-"""Of the objective of edges as wrong as they can be: below it, a cost is rounding."""
+"""Share of the objective at the worst residuals below which a cost is rounding."""
 NO_ROWS = np.zeros(0, np.int64)
 
 

@@ -15,13 +15,13 @@ PLANAR_AXES = np.array([2, 3, 4])
 OUT_OF_PLANE = np.array([0, 1, 5])
 PLANAR_TOLERANCE = 1e-12
 INDEFINITE_TOLERANCE = 1e-9
-"""Of the largest eigenvalue: a more negative one is not rounding."""
+"""Share of the largest eigenvalue up to which a negative one is rounding."""
 EARTH_M = 1.2742e7
 """The earth's diameter: a longer edge is a unit or a measurement gone wrong."""
 RESOLVED = float(1 / np.finfo(float).eps)
-"""Ratio of weights up to which the rounding of a cost's larger terms leaves the smaller ones."""
+"""Ratio of weights beyond which the smaller terms of a cost are lost in the rounding of the larger."""
 FLOOR = 1e-9
-"""Of the median weight: for a used edge without information on rotation, or on translation."""
+"""Weight, relative to the median, of a used edge without information on rotation, or on translation."""
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,15 @@ class Weights:
 
 
 def dimension_of(graph: ViewGraph) -> Literal[2, 3]:
-    """How many dimensions the frames move in: two also where every edge of a graph in space lies in the plane z = 0 and
-    has no information out of it, as of one that was lifted.
+    """The dimension of a graph: 2 also for one in space whose edges lie in the plane z = 0 and have no information out
+    of it, as a lifted planar graph.
     """
     lifted = moves_in_plane(graph) and not graph.information[:, OUT_OF_PLANE].any()
     return 2 if graph.dimension == 2 or lifted else 3
 
 
 def moves_in_plane(graph: ViewGraph) -> bool:
-    """Whether every edge of a graph lies in the plane z = 0, and errors out of it tell nothing of those in it."""
+    """Whether every edge lies in the plane z = 0 and its errors out of the plane are uncorrelated with those in it."""
     if graph.dimension == 2 or not graph.edge_count:
         return graph.dimension == 2
     motion = graph.i_from_j

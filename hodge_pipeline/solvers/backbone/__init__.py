@@ -1,1 +1,1 @@
-"""A trusted backbone (odometry) and loops of unknown worth: which loops are right, and the poses that follow."""
+"""A trusted backbone (odometry) and loop closures that may be wrong: which are right, and the poses that follow."""

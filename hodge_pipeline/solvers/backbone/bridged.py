@@ -1,4 +1,4 @@
-"""Loops judged on a chain that may be broken: a step is bridged where the loops then say much more."""
+"""Loops judged on a chain that may be broken: a step is bridged where this raises the log-evidence of the loops."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.breaks import (
     LOOSE,
     Break,
+    PairwiseConsistency,
     Runs,
-    Testimony,
-    Usual,
+    StepModel,
     agreed_breaks,
     unusual_breaks,
 )
 from hodge_pipeline.solvers.backbone.chain import Chain, linked, loops_at_place
-from hodge_pipeline.solvers.backbone.evidence import Wrong, mixture, student
-from hodge_pipeline.solvers.backbone.fit import Fit, linearise, settled
+from hodge_pipeline.solvers.backbone.evidence import OutlierModel, mixture, student_log_density
+from hodge_pipeline.solvers.backbone.fit import Fit, linearise, optimised
 from hodge_pipeline.solvers.backbone.inference import (
     BY_CHANCE,
     MISTAKEN,
@@ -35,29 +35,34 @@ from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales
 from hodge_pipeline.types import Bools, Ints
 
 MOST_BREAKS, TRIED_AT_ONCE = 10, 2
-"""That are bridged one after the other, and that are tried each time."""
+"""Breaks that are bridged one after the other, and that are tried each time."""
 
 
 CONTRADICTED = 1 / 3
-"""Of the loops at the places of used ones: where fewer agree, these are held against motions drawn at random, which
-takes three times as long as all else. In parts of four graphs of the literature by chance .08 to .35 agree, but for one
-of .5; of right ones .47 to .64 where 60 % of the motions are wrong, .21 to .35 where 90 % are; of RobotCar's .39, .48.
+"""Share of the loops at the places of used ones that must be used: with fewer, these are compared with motions drawn at
+random, which takes three times as long as all else. In parts of four graphs of the literature by chance .08 to .35
+agree, but for one of .5; of right ones .47 to .64 where 60 % of the motions are wrong, .21 to .35 where 90 % are; of
+RobotCar's .39, .48.
 """
 DRAWN = 3
-"""Times that all motions are drawn."""
+"""Times that the motions of all loops are drawn at random."""
 QUANTILE, NORMAL_QUANTILE = 0.75, 1.1503
-"""Of how far motions lie from their middle, which right ones, and a few far off, hardly change; and of a normal one."""
+"""Quantile of the distance from the median by which the spread of motions is estimated, robust to a few outliers; and
+that of a normal distribution.
+"""
 
 
-def infer_bridged(chain: Chain, always: Bools, thin: bool, most: int = MOST_BREAKS) -> tuple[Chain, Inferred] | None:
+def infer_bridged(
+    chain: Chain, trusted: Bools, may_thin: bool, most: int = MOST_BREAKS
+) -> tuple[Chain, Inferred] | None:
     """The chain with its paths joined and up to `most` broken steps bridged, and its loops judged; None as in `infer`.
 
     A step is tried where loops of several places agree that it is broken, or where it is unlike all others. It is
     broken where all loops are likelier with a bridge in its place: by more than chance would have them be.
     """
     chain = unbroken = joined(chain)
-    wrong = Wrong.of(chain, chain.poses)  # one for all trials: evidence is against all loops being wrong
-    judge = partial(infer, wrong=wrong, always=always, thin=thin)
+    outliers = OutlierModel.of(chain, chain.poses)  # one for all trials, which makes their evidence comparable
+    judge = partial(infer, outliers=outliers, trusted=trusted, may_thin=may_thin)
     first = judge(chain)
     if first is None:
         return None
@@ -67,29 +72,29 @@ def infer_bridged(chain: Chain, always: Bools, thin: bool, most: int = MOST_BREA
         if better is None:
             break
         chain, found = better
-    # where nothing confirms the loops, nor is a break confirmed that they speak of
+    # a break found by unconfirmed loops is not confirmed either
     for one, other in [(chain, found)] if found is first else [(chain, found), (unbroken, first)]:
-        if other.confirmed and not (_contradicted(other) and _found_by_chance(one, other, always, judge)):
+        if other.confirmed and not (_contradicted(other) and _found_by_chance(one, other, trusted, judge)):
             return one, other
-    return unbroken, refused(first, always)
+    return unbroken, refused(first, trusted)
 
 
 def _contradicted(found: Inferred) -> bool:
-    """Whether two thirds of the loops at the places of used ones contradict these: of so many some agree by chance."""
+    """Whether fewer than `CONTRADICTED` of the loops at the places of used ones are used: some then agree by chance."""
     places, used = found.start.chain.places, found.used
     return bool(loops_at_place(places[used]).sum() < CONTRADICTED * loops_at_place(places)[used].sum())
 
 
-def _found_by_chance(chain: Chain, found: Inferred, always: Bools, judge: Callable[..., Inferred | None]) -> bool:
-    """Whether loops between the same places say as much if all their motions, but those of `always (M,)`, are drawn at
-    random, as those at hand are spread.
+def _found_by_chance(chain: Chain, found: Inferred, trusted: Bools, judge: Callable[..., Inferred | None]) -> bool:
+    """Whether loops between the same places reach as much log-evidence with motions drawn from a normal distribution as
+    wide as that of the measured ones; those of `trusted (M,)` loops stay.
     """
     rng, twists = np.random.default_rng(4), chain.log(chain.motion)
     middle = np.median(twists, axis=0)
     spread = np.quantile(np.abs(twists - middle), QUANTILE, axis=0) / NORMAL_QUANTILE
     for _ in range(DRAWN):
         drawn = chain.exp(middle + spread * rng.standard_normal(twists.shape))
-        motion = np.where(always[:, None, None], chain.motion, drawn)
+        motion = np.where(trusted[:, None, None], chain.motion, drawn)
         other = judge(replace(chain, motion=motion), scales=found.scales)
         if other is not None and other.log_evidence > found.log_evidence - BY_CHANCE:
             return True
@@ -97,10 +102,10 @@ def _found_by_chance(chain: Chain, found: Inferred, always: Bools, judge: Callab
 
 
 def _better(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]) -> tuple[Chain, Inferred] | None:
-    """The chain with one more step bridged, and its loops judged; None where it has none that is broken."""
+    """The chain with one more broken step bridged, and its loops judged; None where no step is broken."""
     founds = [found]
-    if found.scales != Scales() and (not found.confirmed or (chain.stated and found.scales.surprise() > 0)):
-        # a break that all loops see looks like larger errors of all steps: with these as stated, the loops agree on it
+    if found.scales != Scales() and (not found.confirmed or (chain.stated and found.scales.prior_cost() > 0)):
+        # a break under all loops looks like larger errors of all steps: with errors as stated, the loops agree on it
         founds += [other for other in [judge(chain, scales=Scales())] if other is not None]
     for broken, least in [each for one in founds for each in _candidates(chain, one)]:
         tried = bridged(chain, broken)
@@ -113,79 +118,91 @@ def _better(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]
 
 
 def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
-    """Breaks worth a trial, with what each must win beside what it has won."""
+    """Breaks to try, each with the log-evidence that the loops must gain by it beside its own."""
     linear, factor = found.start, found.judged.factor
     shares = np.log(mixture(factor)[0])
-    told = Testimony(linear.chain, linear, np.logaddexp(shares[0] + factor, shares[1]), found.judged.wrong, found.used)
-    usual, least = Usual.of(chain), by_chance(len(factor))
-    fold = np.log(max((1 / loops_at_place(told.chain.places)).sum(), 1))  # of testimonies, one a place, for the best
-    agreed = [each for each in agreed_breaks(told, usual) if each.log_evidence > BY_CHANCE + fold]
+    by_chain = np.logaddexp(shares[0] + factor, shares[1])
+    pairwise = PairwiseConsistency(linear, by_chain, found.judged.log_wrong, found.used)
+    usual, least = StepModel.of(chain), by_chance(len(factor))
+    fold = np.log(max((1 / loops_at_place(pairwise.chain.places)).sum(), 1))  # for the best of as many places
+    agreed = [each for each in agreed_breaks(pairwise, usual) if each.log_evidence > BY_CHANCE + fold]
     far, agreed = [each for each in agreed if not each.usual], [each for each in agreed if each.usual]
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
-    worth = [(each, least) for each in agreed[:TRIED_AT_ONCE] if each is agreed[0] or each.at != agreed[0].at]
+    candidates = [(each, least) for each in agreed[:TRIED_AT_ONCE] if each is agreed[0] or each.at != agreed[0].at]
     if len(found.reduced.runs):
-        runs = Runs.of(settled(Fit(found.reduced, found.linear), MOST_STEPS), linear.poses, usual)
-        strained, speaks = runs.strained_break(), runs.score(np.array([each.at for each in unlike], np.int64))
-        unlike = [each for each, score in zip(unlike, speaks, strict=True) if score > BY_CHANCE]
-        if strained is not None and strained.log_evidence > BY_CHANCE:
-            worth.append((strained, BY_CHANCE - strained.log_evidence))
-    worth += [(each, max(least - each.log_evidence, BY_CHANCE)) for each in unlike]
-    return worth + [(each, least) for each in far[:1]]
+        runs = Runs.of(optimised(Fit(found.reduced, found.linear), MOST_STEPS), linear.poses, usual)
+        of_run, scores = runs.likeliest_break(), runs.score(np.array([each.at for each in unlike], np.int64))
+        unlike = [each for each, score in zip(unlike, scores, strict=True) if score > BY_CHANCE]
+        if of_run is not None and of_run.log_evidence > BY_CHANCE:
+            candidates.append((of_run, BY_CHANCE - of_run.log_evidence))
+    candidates += [(each, max(least - each.log_evidence, BY_CHANCE)) for each in unlike]
+    return candidates + [(each, least) for each in far[:1]]
 
 
 def bridged(chain: Chain, broken: Break) -> Chain:
-    """The chain with another motion in place of a step."""
-    step, covariance, known = chain.step.copy(), chain.step_covariance.copy(), chain.bridged.copy()
-    step[broken.at], covariance[broken.at], known[broken.at] = broken.motion, broken.covariance, True
-    return replace(chain, step=step, step_covariance=covariance, bridged=known)
+    """The chain with a bridge in place of the broken step."""
+    step, covariance, is_bridged = chain.step.copy(), chain.step_covariance.copy(), chain.bridged.copy()
+    step[broken.at], covariance[broken.at], is_bridged[broken.at] = broken.motion, broken.covariance, True
+    return replace(chain, step=step, step_covariance=covariance, bridged=is_bridged)
 
 
 def joined(chain: Chain) -> Chain:
-    """The chain with bridges between paths, as of several robots, where loops of several places agree how they lie, or
-    more of one place than are mistaken elsewhere, or one says it where hardly any are wrong.
+    """The chain with bridges between its paths, such as those of several robots.
 
-    What the loops between two paths say is kept while neither is joined, and asked anew before none is joined any more.
+    Two paths are joined where loops between several places agree on their relative pose, or more loops of one place
+    than mistaken places have, or a single loop where hardly any is wrong. The evidence of two paths is kept while
+    neither is joined to a third, and computed anew before joining ends.
     """
-    learned, said = None, dict[tuple[int, int], Said]()
+    learned, evidence = None, dict[tuple[int, int], JoinEvidence]()
     while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
         poses = chain.poses
-        wrong = Wrong.of(chain, poses)
-        scales, shares = learned = learned or learn_scales(chain, wrong)
+        outliers = OutlierModel.of(chain, poses)
+        scales, shares = learned = learned or learn_scales(chain, outliers)
         linear, rows = linearise(scales.applied(chain), poses), np.arange(len(chain.ends))
         covariance = by_path(linear, rows)
-        away = wrong.at(linear.chain, rows, linear.loops[0]).log_density(covariance)
-        told, pairs = Testimony.of(linear, away), chain.path[chain.ends]
+        log_wrong = outliers.at(linear.chain, rows, linear.loops[0]).log_density(covariance)
+        pairwise, pairs = PairwiseConsistency.of(linear, log_wrong), chain.path[chain.ends]
         apart = pairs[:, 0] != pairs[:, 1]
-        refuted = np.flatnonzero(~apart & (student(linear.loops[0], covariance)[0] < away))
-        mistaken = [len(group) for group in agreeing_groups(told, refuted)]
+        refuted = np.flatnonzero(~apart & (student_log_density(linear.loops[0], covariance)[0] < log_wrong))
+        mistaken = [len(group) for group in agreeing_groups(pairwise, refuted)]
         two = [(low, high) for low, high in np.unique(pairs[apart], axis=0).tolist()]
-        as_now = not said
-        said = {both: said.get(both) or Said.of(told, np.flatnonzero((pairs == both).all(axis=1))) for both in two}
+        is_fresh = not evidence
+        for both in two:
+            if both not in evidence:
+                evidence[both] = JoinEvidence.of(pairwise, np.flatnonzero((pairs == both).all(axis=1)))
         odds = float(np.log(shares[0] / shares[1]))
-        scores = [said[both].best(mistaken, odds) for both in two]
+        scores = [evidence[both].best(mistaken, odds) for both in two]
         (score, loop), (low, high) = max(zip(scores, two, strict=True))
         if score > 0:
-            last, first = np.flatnonzero(chain.path == low)[-1:], np.flatnonzero(chain.path == high)[:1]
-            # of bridges on the way not even the covariance: each would allow for as much as all before it together
-            steps = np.where(chain.joins[:, None, None], 0.0, linear.chain.step_covariance)
-            told = Testimony.of(replace(linear, chain=replace(linear.chain, step_covariance=steps)), away)
-            end, covariance = told.beyond(np.array([loop]), last, first)
-            motion = se3.inverse(poses[last[0]]) @ end[0]
-            motion[:3, :3] = se3.project_to_so3(motion[:3, :3])  # else rounding doubles with each path
-            chain = linked(chain, low, high, motion, LOOSE**2 * covariance[0])
-            said = {both: each for both, each in said.items() if not {low, high} & {*both}}
-        elif as_now:
+            chain = _joined_by(chain, pairwise, loop, low, high)
+            evidence = {both: each for both, each in evidence.items() if not {low, high} & {*both}}
+        elif is_fresh:
             break
         else:
-            said = {}
+            evidence = {}
     return chain
 
 
+def _joined_by(chain: Chain, pairwise: PairwiseConsistency, loop: int, low: int, high: int) -> Chain:
+    """The chain with a bridge between two paths that leads as one loop between them does."""
+    linear = pairwise.linear
+    last, first = np.flatnonzero(chain.path == low)[-1:], np.flatnonzero(chain.path == high)[:1]
+    # bridges on the way count as exact: with its covariance each would allow for as much as all before it together
+    steps = np.where(chain.joins[:, None, None], 0.0, linear.chain.step_covariance)
+    exact = replace(pairwise, linear=replace(linear, chain=replace(linear.chain, step_covariance=steps)))
+    end, covariance = exact.predicted(np.array([loop]), last, first)
+    motion = se3.inverse(linear.poses[last[0]]) @ end[0]
+    motion[:3, :3] = se3.project_to_so3(motion[:3, :3])  # else rounding doubles with each path
+    return linked(chain, low, high, motion, LOOSE**2 * covariance[0])
+
+
 @dataclass(frozen=True)
-class Said:
-    """What the loops between two paths say of how these lie: that of them with which others of several places agree
-    most, by how many nats more than chance would; and the first loop of the largest group of one place, its size, and
-    those of the groups that contradict it.
+class JoinEvidence:
+    """Evidence for the relative pose of two paths, by the loops between them.
+
+    - `of_places`: by how many nats more than by chance loops of several places agree with one, and this loop.
+    - `first`, `size`: the first loop of the largest group at one place, and how many agree with it; `rivals`: the sizes
+      of groups that contradict it.
     """
 
     of_places: tuple[float, int]
@@ -194,22 +211,23 @@ class Said:
     rivals: tuple[int, ...]
 
     @classmethod
-    def of(cls, told: Testimony, rows: Ints) -> Said:
-        """That of these loops (K,)."""
+    def of(cls, pairwise: PairwiseConsistency, rows: Ints) -> JoinEvidence:
+        """The evidence of the loops `rows (K,)`, at least one, which join the same two paths."""
         best = -np.inf, -1
-        for seed, factor in told.seeds(rows) if len(rows) > 1 else ():
-            score = float(told.gains(seed, rows, factor).sum()) - BY_CHANCE - float(np.log(len(told.away)))
+        for seed, factor in pairwise.seeds(rows) if len(rows) > 1 else ():
+            score = float(pairwise.gains(seed, rows, factor).sum()) - BY_CHANCE - float(np.log(len(pairwise.log_wrong)))
             best = max(best, (score, seed))
-        groups = agreeing_groups(told, rows)
+        groups = agreeing_groups(pairwise, rows)
         first = np.array([group[0] for group in groups])
-        against = np.flatnonzero(told.factor(np.full(len(first), first[0]), first) <= 0)
-        size = int((told.factor(np.full(len(groups[0]), first[0]), groups[0]) > 0).sum())  # where too many, all are
-        return cls(best, int(first[0]), size, tuple(len(groups[each]) for each in against))
+        rivals = np.flatnonzero(pairwise.factor(np.full(len(first), first[0]), first) <= 0)
+        size = int((pairwise.factor(np.full(len(groups[0]), first[0]), groups[0]) > 0).sum())  # where too many, all are
+        return cls(best, int(first[0]), size, tuple(len(groups[each]) for each in rivals))
 
     def best(self, mistaken: list[int], odds: float) -> tuple[float, int]:
-        """The loop to join the paths by, and by how many nats it is likelier than enough: where others of several
-        places agree with it, or more of one place than should where groups of these sizes are mistaken elsewhere. None
-        that no other contradicts is less likely than its `odds` beforehand.
+        """By how many nats the likeliest loop exceeds what joins two paths, and this loop.
+
+        `mistaken`: sizes of groups of wrong loops elsewhere; `odds`: prior log-odds of a loop, the least of a group
+        that no other contradicts.
         """
         sizes = np.array([*mistaken, *self.rivals])
         likely = max(-_mistaken(self.size, sizes), -np.inf if self.rivals else odds)
@@ -217,8 +235,8 @@ class Said:
 
 
 def _mistaken(size: int, others: Ints) -> float:
-    """The logarithm of how many groups of `size` loops should be mistaken where those of sizes `others (K,)` are, which
-    are taken to be exponential; a loop by itself is no group.
+    """The logarithm of how many groups of at least `size` wrong loops are expected where those of sizes `others (K,)`
+    are wrong, by an exponential distribution of sizes; single loops are left out.
     """
     others = others[others > 1]
     count, total = len(others), float(others.sum())

@@ -17,22 +17,22 @@ from hodge_pipeline.solvers.weights import PLANAR_AXES
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 PLACE = 4.0
-"""Loops of which the steps between their ends vary less than so many loops do are of one place."""
+"""Length of a place: steps whose variances add up to those of this many loops."""
 STEPS_OF_PLACE, FEWEST_PLACES = 20, 50
-"""Steps that a place has at the least, however large the errors of steps are; places that a path has, however small."""
+"""Fewest steps of a place, however large their errors; fewest places of a chain, however small these are."""
 
 
 @dataclass(frozen=True)
 class Chain:
-    """Paths of vertices one after the other, and all other edges as loops between their positions.
+    """Paths of vertices one after the other, and all other edges as loops between positions along them.
 
     - `order (n,)`: the vertex at each position; `path (n,)`: the path it lies on, ascending.
     - `step (n, 4, 4)` from the position before, `step_covariance (n, p, p)` of ξ in `step · exp(ξ)`, and the graph's
       edge `step_edge (n,)` that they come from; identity, zeros and −1 where a path begins.
     - `loop_edge (M,)`; `ends (M, 2)`, the first the lower position; `motion (M, 4, 4)`; `covariance (M, p, p)`.
-    - `bridged (n,)`: steps with a guess in place of what the graph says; no scale is learned for its covariance.
-    - `axes (p,)`: of a twist those that are free, three in the plane; `stated`: whether the graph's information is more
-      than the identity that stands for unknown, and most steps state something of each axis.
+    - `bridged (n,)`: steps whose motion is a guess, of a broken step or between paths; no scale is learned for them.
+    - `axes (p,)`: free axes of a twist, three in the plane; `stated`: the graph has information, not the identity that
+      stands for unknown, and most steps constrain every axis.
     """
 
     order: Ints
@@ -59,7 +59,7 @@ class Chain:
         return len(self.axes) == 6
 
     @property
-    def turns(self) -> int:
+    def rotation_axes(self) -> int:
         """How many of a twist's free axes are rotations."""
         return 3 if self.is_spatial else 1
 
@@ -98,8 +98,8 @@ class Chain:
 
     @cached_property
     def places(self) -> Floats:
-        """Where the ends of each loop (M, 2) lie along the chain, in places: of one place are loops both ends of which
-        lie within 1. These are one testimony, however many agree, since a place may be mistaken for another.
+        """The ends of each loop (M, 2) along the chain, in units of places: loops are of one place where both ends lie
+        within 1. They count once, however many agree, since all of them are wrong where a place is mistaken.
         """
         own = np.median(np.einsum("mii->mi", self.covariance), axis=0)
         steps = np.where(self.bridged[:, None], 0.0, np.einsum("nii->ni", self.step_covariance))
@@ -108,39 +108,39 @@ class Chain:
         return np.asarray(np.cumsum(along)[self.ends])
 
     def corridors_over(self, at: int, loops: Ints) -> int:
-        """Of how many corridors those of the loops (K,) are that lead over a position: one that is mistaken for another
-        agrees with a break anywhere.
+        """How many corridors (see `corridors`) the loops (K,) that pass over the step to a position belong to: loops of
+        a single one, mistaken for another, agree with a break anywhere.
         """
         low, high = self.ends[loops].T
         ends = self.places[loops[(low < at) & (at <= high)]]
         return len(np.unique(corridors(ends[one_of_each_place(ends)]))) if len(ends) else 0
 
     def spans(self, edges: Ints) -> Ints:
-        """The positions (K, 2) of two vertices each, the lower first."""
+        """The positions (K, 2) of the vertices of edges (K, 2), the lower first."""
         return np.sort(np.argsort(self.order)[edges], axis=1)
 
-    def over(self, ends: Ints, worth: Floats | None = None) -> Floats:
-        """How many of the spans (K, 2) of positions, or how much of their `worth (K,)`, pass over each step (n,)."""
+    def over(self, ends: Ints, weight: Floats | None = None) -> Floats:
+        """The number (n,), or total `weight (K,)`, of the spans (K, 2) of positions that pass over each step."""
         low, high = ends.T
-        change = np.bincount(low + 1, worth, self.size + 1) - np.bincount(high + 1, worth, self.size + 1)
+        change = np.bincount(low + 1, weight, self.size + 1) - np.bincount(high + 1, weight, self.size + 1)
         return np.asarray(np.cumsum(change)[:-1])
 
     def with_loops(self, rows: Ints, ends: Ints) -> Chain:
-        """The chain with these of its loops alone, between other ends (K, 2)."""
+        """The chain with the loops `rows (K,)` alone, moved to other ends (K, 2)."""
         motion, covariance = self.motion[rows], self.covariance[rows]
         return replace(self, loop_edge=self.loop_edge[rows], ends=ends, motion=motion, covariance=covariance)
 
     def adjoint(self, poses: Floats) -> Floats:
-        """Ad (..., p, p) of the free axes."""
+        """Adjoint matrices (..., p, p) of poses, in the free axes."""
         return se3.adjoint(poses) if self.is_spatial else plane.adjoint(poses)
 
     def lever(self, origin: Floats) -> Floats:
-        """The lower left block (K, 3, 3), (K, 2, 1) in the plane, of what takes twists to other origins (K, 3)."""
+        """Lever arms (K, 3, 3), (K, 2, 1) in the plane: the lower left block of the adjoint of a shift by −origin."""
         turns = self.axes < 3
         return se3.hat(-origin)[:, self.axes[~turns, None] - 3, self.axes[turns]]
 
     def carried(self, poses: Floats, covariance: Floats) -> Floats:
-        """Covariances (..., p, p) of twists, in the axes that the poses lead to: `Ad Σ Adᵀ`."""
+        """Covariances `Ad Σ Adᵀ` (..., p, p) of twists, taken by the adjoints of poses (..., 4, 4)."""
         if not self.is_spatial:
             return plane.carried(poses, covariance)
         into = self.adjoint(poses)
@@ -164,31 +164,31 @@ class Chain:
 
 
 def consecutive_edges(graph: ViewGraph) -> Bools:
-    """Edges (E,) between vertices that follow each other in the order of their ids."""
+    """Which edges (E,) join vertices that follow each other in the order of their ids."""
     return np.asarray(steps_apart(graph) == 1)
 
 
 def steps_apart(graph: ViewGraph) -> Ints:
-    """How far apart the vertices of each edge (E,) lie in the order of their ids."""
+    """The distance (E,) of the vertices of each edge in the order of their ids."""
     return np.asarray(np.abs(np.diff(vertex_ranks(graph)[graph.edges], axis=1)[:, 0]))
 
 
 def vertex_ranks(graph: ViewGraph) -> Ints:
-    """The place (V,) of each vertex in the order of the ids where these are numbers, else of the rows."""
+    """The rank (V,) of each vertex by its id where ids are numbers, else its row."""
     if graph.vertex_ids.dtype.kind in "iu":
         return np.argsort(np.argsort(graph.vertex_ids, kind="stable"), kind="stable")
     return np.arange(graph.vertex_count)
 
 
 def sequential_edges(graph: ViewGraph) -> Bools:
-    """Consecutive edges (E,), the first of parallel ones."""
+    """Which edges (E,) are consecutive, only the first of parallel ones."""
     out, rows = np.zeros(graph.edge_count, bool), np.flatnonzero(consecutive_edges(graph))
     out[rows[np.unique(np.sort(graph.edges[rows], axis=1), axis=0, return_index=True)[1]]] = True
     return out
 
 
 def linear_forest(edges: Ints, count: int, trusted: Bools) -> Bools:
-    """Trusted edges (E,) that make paths: no vertex of more than two, no cycle; those of neighbouring rows first."""
+    """Trusted edges (E,) that form paths: a linear forest, chosen greedily, edges between near vertex rows first."""
     rows = np.flatnonzero(trusted & (edges[:, 0] != edges[:, 1]))
     rows = rows[np.argsort(np.abs(edges[rows, 0] - edges[rows, 1]), kind="stable")]
     degree, root = [0] * count, list(range(count))
@@ -208,8 +208,8 @@ def linear_forest(edges: Ints, count: int, trusted: Bools) -> Bools:
 
 
 def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
-    """The chain of the backbone's edges (E,), which make paths; edges from a vertex to itself are left out."""
-    graph, told = believed(graph, backbone)
+    """The chain of the backbone's edges (E,), a linear forest; the other edges are its loops, without self-loops."""
+    graph, as_stated = credible_steps(graph, backbone)
     order, step_edge, path = _walk(graph.edges, graph.vertex_count, np.flatnonzero(backbone))
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
@@ -220,9 +220,9 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
     rows = rows[np.lexsort((high, low))]  # samples of the loops must not depend on the order of the file
     step, step_covariance = np.tile(np.eye(4), (len(order), 1, 1)), np.zeros((len(order), len(axes), len(axes)))
     at = np.flatnonzero(step_edge >= 0)
-    step[at], step_covariance[at] = _directed(
-        graph.i_from_j[step_edge[at]], covariance[step_edge[at]], place[graph.edges[step_edge[at], 0]] == at, axes
-    )
+    edge = step_edge[at]
+    is_reversed = place[graph.edges[edge, 0]] == at
+    step[at], step_covariance[at] = _directed(graph.i_from_j[edge], covariance[edge], is_reversed, axes)
     ends = place[graph.edges[rows]]
     motion, loop_covariance = _directed(graph.i_from_j[rows], covariance[rows], ends[:, 0] > ends[:, 1], axes)
     usual = np.median(np.einsum("eii->ei", np.concatenate([step_covariance[at], loop_covariance])), axis=0)
@@ -240,31 +240,31 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
         loop_covariance,
         np.zeros(len(order), bool),
         axes,
-        told and not has_unit_information(graph),
+        as_stated and not has_unit_information(graph),
     )
 
 
 SMALLEST_SIGMA = 0.03
-"""Of the usual standard deviation: none is believed to be much smaller. Beside one of a thousandth the normal
-equations lose what the other edges say; from .01 to .1 the manhattan graph is judged alike.
+"""Share of the median standard deviation that is added to each, in squares. Beside one of a thousandth the normal
+equations lose the other edges to rounding; from .01 to .1 the manhattan graph is judged alike.
 """
 
 
 MOST_OF_A_STEP = 0.2
-"""An odometry's error where it states no larger one, root mean squares. On 71 simulated graphs where nothing is stated
-75 wrong loops were kept without it and 19 with it, 13 and 12 right ones lost.
+"""Bound on the error of odometry as a share of its motion (root mean squares), unless it states more. On 71 simulated
+graphs without information 75 wrong loops were kept without it and 19 with it, 13 and 12 right ones lost.
 """
 NOTHING_RAD, NOTHING_TIMES = np.pi, 100.0
-"""Standard deviations of steps, in radians and in those of the middle one of three axes, from which on they state
-nothing: robots on a floor fill the covariance of their odometry with 1e6 for what they assume and 1e3 for what they do
-not know.
+"""Standard deviations beyond which an axis is unconstrained: radians, and multiples of that of the median axis of the
+translation. Robots on a floor have 1e6 in their odometry's covariance for what they assume, 1e3 for the unknown.
 """
 
 
-def believed(graph: ViewGraph, steps: Bools) -> tuple[ViewGraph, bool]:
-    """The graph with what is believed of its steps (E,), and whether that is what they state: an axis of which most of
-    them state nothing errs as the others of its kind do, or by `MOST_OF_A_STEP` where that is more. Of unknown
-    information, the identity, nothing is changed.
+def credible_steps(graph: ViewGraph, steps: Bools) -> tuple[ViewGraph, bool]:
+    """The graph with credible information on its steps (E,), and whether that is what they state.
+
+    Along an axis that most steps leave unconstrained, errors are set to those of the other axes of rotation or
+    translation, or to `MOST_OF_A_STEP` of the motion where that is more. The identity, for unknown information, stays.
     """
     rows, axes = np.flatnonzero(steps), free_axes(graph)
     if has_unit_information(graph) or not len(rows):
@@ -274,10 +274,10 @@ def believed(graph: ViewGraph, steps: Bools) -> tuple[ViewGraph, bool]:
     usual, factor = np.median(spread, axis=0), np.ones_like(spread)
     for part, least in ((np.flatnonzero(axes < 3), NOTHING_RAD), (np.flatnonzero(axes >= 3), 0.0)):
         step = float(np.sqrt(np.mean(moved[:, part] ** 2)))
-        told = usual[part] <= (least or max(step, NOTHING_TIMES * float(np.median(usual[part]))))
-        if not told.all() and step > 0:
-            others = np.sqrt(np.mean(spread[:, part[told]] ** 2, axis=1)) if told.any() else 0.0
-            factor[:, part[~told]] = (np.maximum(others, MOST_OF_A_STEP * step) / spread[:, part[~told]].T).T
+        as_stated = usual[part] <= (least or max(step, NOTHING_TIMES * float(np.median(usual[part]))))
+        if not as_stated.all() and step > 0:
+            others = np.sqrt(np.mean(spread[:, part[as_stated]] ** 2, axis=1)) if as_stated.any() else 0.0
+            factor[:, part[~as_stated]] = (np.maximum(others, MOST_OF_A_STEP * step) / spread[:, part[~as_stated]].T).T
     if (factor == 1).all():
         return graph, True
     information = graph.information.copy()
@@ -287,12 +287,12 @@ def believed(graph: ViewGraph, steps: Bools) -> tuple[ViewGraph, bool]:
 
 
 def free_axes(graph: ViewGraph) -> Ints:
-    """Of a twist (6,) the axes in which the graph's frames move."""
+    """The axes (p,) of a twist in which the graph's frames move."""
     return PLANAR_AXES if graph.dimension == 2 else np.arange(6)
 
 
 def linked(chain: Chain, low: int, high: int, motion: Floats, covariance: Floats) -> Chain:
-    """The chain with the path `high` behind the path `low < high`, and a bridge of this motion (4, 4) between them."""
+    """The chain with path `high` appended to path `low < high` by a bridge: its motion (4, 4), covariance (p, p)."""
     second = chain.path == high
     after = int(np.flatnonzero(chain.path == low)[-1]) + 1
     moved = np.concatenate([np.arange(after), np.flatnonzero(second), np.flatnonzero(~second[after:]) + after])
@@ -317,7 +317,7 @@ def linked(chain: Chain, low: int, high: int, motion: Floats, covariance: Floats
 
 
 def _directed(motion: Floats, covariance: Floats, reverse: Bools, axes: Ints) -> tuple[Floats, Floats]:
-    """Motions and covariances, of some the inverse: `Z⁻¹` has the covariance `Ad(Z) Σ Ad(Z)ᵀ`."""
+    """Motions and covariances, inverted where `reverse`: `Z⁻¹` has the covariance `Ad(Z) Σ Ad(Z)ᵀ`."""
     motion, covariance = motion.copy(), covariance.copy()
     turned = se3.adjoint(motion[reverse])[:, axes[:, None], axes]
     covariance[reverse] = turned @ covariance[reverse] @ np.swapaxes(turned, 1, 2)
@@ -326,7 +326,7 @@ def _directed(motion: Floats, covariance: Floats, reverse: Bools, axes: Ints) ->
 
 
 def _walk(edges: Ints, count: int, rows: Ints) -> tuple[Ints, Ints, Ints]:
-    """Vertices (V,) path by path, the edge that leads to each (−1 at a beginning), and its path."""
+    """Vertices (V,) path by path, the edge that leads to each (−1 where a path begins), and its path."""
     ends = np.flatnonzero(np.bincount(edges[rows].ravel(), minlength=count) < 2)
     component = connected_components(edges[rows], count)
     begins = ends[np.unique(component[ends], return_index=True)[1]]
@@ -337,13 +337,13 @@ def _walk(edges: Ints, count: int, rows: Ints) -> tuple[Ints, Ints, Ints]:
 
 
 def loops_at_place(ends: Floats) -> Floats:
-    """How many loops (M,), each itself included, are of the place of each; `ends (M, 2)` are given in places."""
+    """How many loops (M,), itself included, are of the same place as each; `ends (M, 2)` as in `Chain.places`."""
     near = cKDTree(ends).query_ball_point(ends, 1.0, p=np.inf, return_length=True) if len(ends) else []
     return np.asarray(near, float)
 
 
 def one_of_each_place(ends: Floats) -> Ints:
-    """Rows of loops, ascending, whose `ends (M, 2)` are given in places: first those that have the most others near."""
+    """Rows of one loop of each place, ascending, those with most loops near first; `ends (M, 2)` in places."""
     tree, free, out = cKDTree(ends), np.ones(len(ends), bool), []
     for row in np.argsort(-loops_at_place(ends), kind="stable").tolist():
         if free[row]:
@@ -353,9 +353,7 @@ def one_of_each_place(ends: Floats) -> Ints:
 
 
 def corridors(ends: Floats) -> Ints:
-    """The runs (K,) of places that follow each other, of which loops have these ends (K, 2), in parts of up to
-    `LONGEST_CORRIDOR`.
-    """
+    """The corridor (K,) of each loop: a run of adjacent places, cut to `LONGEST_CORRIDOR`; `ends (K, 2)` in places."""
     adjacent = cKDTree(ends).query_pairs(ADJACENT, p=np.inf, output_type="ndarray")
     run = connected_components(adjacent, len(ends))
     part, after = np.empty_like(run), 0
@@ -369,8 +367,8 @@ def corridors(ends: Floats) -> Ints:
 
 
 ADJACENT = 2.0
-"""Places between places that follow each other: a corridor that is mistaken for another is one testimony."""
+"""Distance in places up to which places are adjacent: a corridor that is mistaken for another counts once."""
 LONGEST_CORRIDOR = 5.0
-"""Places of a mistaken corridor, of 20 steps or more each: a longer run is as many testimonies as it has such parts.
-Without a limit none of 52 loops of a second lap counted, each of which says nothing alone beside 160 m of drift.
+"""Most places of a mistaken corridor, of 20 steps or more each: a longer run is cut. Without a limit none of 52 loops
+of a second lap counted, each of which says nothing alone beside 160 m of drift.
 """

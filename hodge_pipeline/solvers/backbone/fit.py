@@ -1,9 +1,9 @@
 """Gauss–Newton on a chain with some of its loops: exact on all poses, at the cost of the loops' ends alone.
 
-In the world frame a step's residual ρ and covariance C add up along a path, so that a run of steps between two ends of
-loops is one edge (Σρ, ΣC), and the poses inside follow from those of its ends. Loops, ends and what is solved for are
-in axes parallel to the world's with the origin at the pose itself, runs with the origin at their later ends: far from
-the world's origin, its own lever arm would make every block of the normal equations ill-conditioned.
+In the world frame the steps' residuals ρ and covariances C add up along a path, so that a run of steps between two ends
+of loops is one edge (Σρ, ΣC), and the poses inside follow from those of its ends. Twists are in axes parallel to the
+world's, about the pose itself, those of runs and loops about their later ends: far from the world's origin, a lever arm
+to it would make every block of the normal equations ill-conditioned.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 @dataclass(frozen=True)
 class Linear:
-    """The chain at some poses (n, 4, 4): `residual (n, p)` are the steps' in world axes, summed over positions."""
+    """The chain linearised at poses (n, 4, 4); `residual (n, p)`: of the steps about the world's origin, cumulative."""
 
     chain: Chain
     poses: Floats
@@ -30,7 +30,7 @@ class Linear:
 
     @cached_property
     def covariance(self) -> Floats:
-        """The steps' covariances summed over positions (n, p, p), about the world's origin: in extended precision."""
+        """Cumulative covariance (n, p, p) of the steps about the world's origin, in extended precision."""
         each = self.chain.carried(self.poses, self.chain.step_covariance)
         by_entry = np.ascontiguousarray(each.reshape(len(each), -1).T)
         return np.asarray(np.cumsum(by_entry, axis=1, dtype=np.longdouble).T.reshape(each.shape))
@@ -49,11 +49,11 @@ class Linear:
         return shifted(self.covariance[high] - self.covariance[low], self.chain.lever(to))
 
     def shift(self, at: Ints) -> Floats:
-        """What takes twists (K, p, p) at the world's origin to those of these positions."""
+        """Matrices (K, p, p) that take twists about the world's origin to these positions."""
         return self._identity_and(self.chain.lever(self.poses[at, :3, 3]))
 
     def carry(self, a: Ints, b: Ints) -> Floats:
-        """What takes twists (K, p, p) at one position's origin to another's."""
+        """Matrices (K, p, p) that take twists about positions `a (K,)` to positions `b (K,)`."""
         to, back = (self.chain.lever(self.poses[each, :3, 3]) for each in (b, a))
         return self._identity_and(to - back)
 
@@ -77,36 +77,46 @@ def shifted(covariance: Floats, lever: Floats) -> Floats:
 
 
 def linearise(chain: Chain, poses: Floats) -> Linear:
-    """The chain's sums at these poses (n, 4, 4)."""
-    left = chain.log(chain.between(chain.step[1:], chain.between(poses[:-1], poses[1:])))
+    """The chain linearised at these poses (n, 4, 4)."""
+    twist = chain.log(chain.between(chain.step[1:], chain.between(poses[:-1], poses[1:])))
     residual = np.zeros((chain.size, len(chain.axes)))
-    residual[1:] = np.einsum("nij,nj->ni", chain.adjoint(poses[1:]), left)
+    residual[1:] = np.einsum("nij,nj->ni", chain.adjoint(poses[1:]), twist)
     residual[~chain.inner] = 0.0
     return Linear(chain, poses, np.cumsum(residual, axis=0))
 
 
 def loops_at(chain: Chain, poses: Floats, rows: Ints) -> tuple[Floats, Floats]:
-    """Residuals (K, p) and covariances (K, p, p) of loops, in the world's directions at their later ends."""
+    """Residuals (K, p) and covariances (K, p, p) of loops, about their later ends in world axes."""
     a, b = chain.ends[rows].T
-    turned = se3.from_parts(poses[b, :3, :3], np.zeros(3))
-    left = chain.log(chain.between(chain.motion[rows], chain.between(poses[a], poses[b])))
-    return np.einsum("nij,nj->ni", chain.adjoint(turned), left), chain.carried(turned, chain.covariance[rows])
+    covariance = chain.carried(turned(poses[b]), chain.covariance[rows])
+    return motion_residuals(chain, chain.motion[rows], poses[a], poses[b]), covariance
+
+
+def motion_residuals(chain: Chain, motion: Floats, from_a: Floats, from_b: Floats) -> Floats:
+    """Residuals (K, p) of motions between poses a and b (K, 4, 4), about b in world axes."""
+    twist = chain.log(chain.between(motion, chain.between(from_a, from_b)))
+    return np.asarray(np.einsum("nij,nj->ni", chain.adjoint(turned(from_b)), twist))
+
+
+def turned(poses: Floats) -> Floats:
+    """The rotations of poses (K, 4, 4), as motions from their axes to world axes about the same origin."""
+    return se3.from_parts(poses[:, :3, :3], np.zeros(3))
 
 
 ROUNDING = 1e-12
-"""Of a diagonal of ones: what differences of long sums may have wrong."""
+"""Added to the diagonal of a correlation matrix: the rounding of differences of long sums."""
 
 
-def scaled(covariance: Floats) -> tuple[Floats, Floats]:
-    """Covariances (M, p, p) in units (M, p) that make their diagonals one, positive definite for certain."""
+def correlation(covariance: Floats) -> tuple[Floats, Floats]:
+    """Correlation matrices (M, p, p) of covariances, made positive definite, and standard deviations (M, p)."""
     unit = np.sqrt(np.maximum(np.einsum("mii->mi", covariance), np.finfo(float).tiny))
     ones = covariance / (unit[:, :, None] * unit[:, None, :])
     return 0.5 * (ones + np.swapaxes(ones, 1, 2)) + ROUNDING * np.eye(covariance.shape[-1]), unit
 
 
-def root(covariance: Floats) -> Floats:
-    """Cholesky factors (M, p, p) of covariances; where long sums left one indefinite, its eigenvalues are lifted."""
-    ones, unit = scaled(covariance)
+def cholesky(covariance: Floats) -> Floats:
+    """Lower Cholesky factors (M, p, p) of covariances; eigenvalues of indefinite ones, by rounding, are clipped."""
+    ones, unit = correlation(covariance)
     try:
         factor = np.linalg.cholesky(ones)
     except np.linalg.LinAlgError:
@@ -117,22 +127,22 @@ def root(covariance: Floats) -> Floats:
 
 
 LIFTED = 1e-9
-"""Of a diagonal of ones: the least eigenvalue then."""
+"""Least eigenvalue of a correlation matrix then."""
 
 
 def inverse(covariance: Floats) -> Floats:
-    """The inverses (M, p, p), symmetric."""
-    ones, unit = scaled(covariance)
+    """The symmetric inverses (M, p, p) of covariances."""
+    ones, unit = correlation(covariance)
     found = np.linalg.inv(ones) / (unit[:, :, None] * unit[:, None, :])
     return np.asarray(0.5 * (found + np.swapaxes(found, 1, 2)))
 
 
 @dataclass(frozen=True)
 class Reduced:
-    """The ends of the active loops and the runs of steps between them.
+    """The graph of the ends of the active loops, joined by these loops and by runs of steps.
 
-    - `ends (R,)`: positions, ascending; `runs (S, 2)`: rows of it; `active (L,)`: rows of the loops.
-    - `network`: of the runs and then the loops.
+    - `ends (R,)`: positions, ascending; `runs (S, 2)`: rows of `ends`; `active (L,)`: rows of the chain's loops.
+    - `network`: its edges are the runs and then the active loops.
     - `anchor (n,)`: the row of the end that each position follows, the one before it or else the next; `touched (n,)`:
       whether its path has one.
     """
@@ -146,7 +156,7 @@ class Reduced:
 
     @classmethod
     def of(cls, chain: Chain, active: Ints) -> Reduced:
-        """The network of these loops."""
+        """The graph of these loops (rows)."""
         ends = np.unique(chain.ends[active])
         after = np.flatnonzero(chain.path[ends[1:]] == chain.path[ends[:-1]])
         runs = np.stack([after, after + 1], axis=1)
@@ -173,13 +183,13 @@ class Reduced:
 
     @cached_property
     def first(self) -> Ints:
-        """The first row (S,) of each run among those positions."""
+        """The first row (S,) of each run in `inside`."""
         length = self.ends[self.runs[:, 1]] - self.ends[self.runs[:, 0]]
         return np.asarray(np.cumsum(length) - length)
 
 
 def _anchor(chain: Chain, ends: Ints) -> tuple[Ints, Bools]:
-    """See `Reduced`."""
+    """`Reduced.anchor` and `Reduced.touched`."""
     where = np.arange(chain.size)
     if not len(ends):
         return where, where < 0
@@ -190,7 +200,7 @@ def _anchor(chain: Chain, ends: Ints) -> tuple[Ints, Bools]:
 
 
 def thinned(chain: Chain, rows: Ints) -> Reduced:
-    """The network of these loops, or of as many of them, spread evenly over their ends, as can be inverted."""
+    """The graph of these loops, or of an evenly spread subset with at most `MOST_UNKNOWNS` in its dense part."""
     spread, count = rows[np.argsort(chain.ends[rows, 0], kind="stable")], min(len(rows), MOST_ACTIVE)
     while True:
         chosen = spread[np.linspace(0, len(spread) - 1, count).astype(np.int64)]
@@ -202,18 +212,18 @@ def thinned(chain: Chain, rows: Ints) -> Reduced:
 
 
 MOST_UNKNOWNS = 1500
-"""In a dense matrix, which takes .5 CPU s to invert."""
+"""Unknowns of a dense matrix, which takes .5 CPU s to invert."""
 MOST_ACTIVE = 2000
-"""Loops at the most: between their ends even a long path drifts by little. With 400, lattices are judged in three
+"""Active loops: between the ends of so many even a long path drifts by little. With 400, lattices are judged in three
 fifths of the time, but of INTEL's 500 wrong loops in groups of ten 422 are kept; none with 1000.
 """
 THINNING = 0.8
-"""Of as many loops as would leave `MOST_UNKNOWNS` if these grew in proportion to the loops."""
+"""Factor on the number of loops that would leave `MOST_UNKNOWNS` if unknowns were proportional to loops."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """The network of some loops at some poses: its runs and, after them, its loops."""
+    """A reduced graph linearised at some poses; its edges are the runs and then the active loops."""
 
     reduced: Reduced
     linear: Linear
@@ -238,24 +248,24 @@ class Fit:
 
     @cached_property
     def covariance(self) -> Floats:
-        """Of the runs and the active loops (S + L, p, p)."""
+        """Covariances (S + L, p, p) of the runs and the active loops."""
         return np.concatenate([self.runs, self.loops[1]])
 
     @cached_property
     def precision(self) -> Floats:
-        """The inverse (S + L, p, p) of these."""
+        """Information (S + L, p, p) of the runs and the active loops."""
         return inverse(self.covariance)
 
     @cached_property
     def residual(self) -> Floats:
-        """Of the runs and the active loops (S + L, p)."""
+        """Residuals (S + L, p) of the runs and the active loops, about their later ends."""
         linear, (low, high) = self.linear, self.reduced.ends[self.reduced.runs].T
         along = linear.shift(high) @ (linear.residual[high] - linear.residual[low])[..., None]
         return np.concatenate([along[..., 0], self.loops[0]])
 
     @cached_property
     def carry(self) -> Floats:
-        """From the first end of each run and active loop to its second (S + L, p, p)."""
+        """Matrices (S + L, p, p) that take twists from the first end of each edge to its second."""
         return self.linear.carry(*self.reduced.ends[self.reduced.network.edges].T)
 
     @cached_property
@@ -264,7 +274,7 @@ class Fit:
         return self.reduced.network.factor(self.precision, self.carry)
 
     def force(self, pushed: Floats) -> Floats:
-        """Minus half the gradient (R, p, c) for residuals times precisions (S + L, p, c)."""
+        """Minus half the gradient of χ² (R, p, c) by the ends, of residuals times precisions `pushed (S + L, p, c)`."""
         edges = self.reduced.network.edges
         out = np.zeros((len(self.reduced.ends), *pushed.shape[1:]))
         np.add.at(out, edges[:, 0], np.swapaxes(self.carry, 1, 2) @ pushed)
@@ -282,31 +292,31 @@ class Fit:
         return self.factor.log_det - float(np.linalg.slogdet(self.precision)[1].sum())
 
     def left_out(self, rows: slice) -> tuple[Floats, Floats]:
-        """Residuals (K, p) of these runs or active loops at poses solved without each, `V S⁻¹ r` with the covariances V
-        there and S of r, and V (K, p, p).
+        """Leave-one-out residuals `V S⁻¹ r` (K, p) of these edges, at poses solved without each, and their covariances
+        V (K, p, p); S is the covariance of an edge and r its residual with it.
         """
         own = self.covariance[rows]
         there = _without(own, self.factor.across()[rows])
         return (there @ np.linalg.solve(own, self.residual[rows, :, None]))[..., 0], there
 
     def moves(self) -> tuple[Floats, float]:
-        """The Gauss–Newton move (R, p) of the ends, about the world's origin, and how much of χ² it should win."""
+        """The Gauss–Newton step (R, p) of the ends, about the world's origin, and the predicted decrease of χ²."""
         force = self.force(self.precision @ self.residual[..., None])
         at_ends = self.factor.solve(force)
         lever = self.linear.chain.lever(self.linear.poses[self.reduced.ends, :3, 3])
         return _to_origin(lever, at_ends[..., 0]), float((at_ends * force).sum())
 
     def moved(self, moves: Floats) -> Floats:
-        """The poses (n, 4, 4) after a move (R, p) of the loops' ends: runs bend by their covariance, what lies beyond
-        the outermost ends follows them rigidly.
+        """The poses (n, 4, 4) after a step (R, p) of the ends: the gap of a run is spread over its steps by their
+        covariance, positions beyond the outermost ends follow them rigidly.
         """
         chain, (first, second) = self.linear.chain, self.reduced.runs.T
         out = self._bent(moves[second] - moves[first]) + moves[self.reduced.anchor]
         out[~self.reduced.touched] = 0.0
         return chain.compose(chain.exp(out), self.linear.poses)
 
-    def between(self, ends: Floats) -> Floats:
-        """The poses (n, 4, 4) where the loops' ends have these (R, 4, 4), however far from theirs."""
+    def with_ends(self, ends: Floats) -> Floats:
+        """The poses (n, 4, 4) where the ends have poses (R, 4, 4), however far from the present ones."""
         linear, (first, second), touched = self.linear, self.reduced.runs.T, self.reduced.touched
         chain, move = linear.chain, ends @ se3.inverse(linear.poses[self.reduced.ends])
         out = self._bent(chain.log(chain.between(move[first], move[second])))
@@ -316,8 +326,8 @@ class Fit:
         return moved
 
     def _bent(self, gap: Floats) -> Floats:
-        """How each position moves (n, p) beside its anchor, the end that it follows, where the second end of each run
-        moves so (S, p) beside its first, about the world's origin.
+        """The step (n, p) of each position relative to that of its anchor, for steps `gap (S, p)` of the second end of
+        each run relative to its first; about the world's origin.
         """
         reduced, linear = self.reduced, self.linear
         (at, run), (begin, end) = reduced.inside, reduced.ends[reduced.runs].T
@@ -332,25 +342,25 @@ class Fit:
 
 
 def _to_origin(lever: Floats, twists: Floats) -> Floats:
-    """Twists (K, p) about other origins, about the world's: see `Chain.lever`."""
+    """Twists (K, p) taken from other origins to the world's: see `Chain.lever`."""
     out = twists.copy()
     out[:, -lever.shape[1] :] -= np.einsum("kij,kj->ki", lever, twists[:, : lever.shape[2]])
     return out
 
 
 LEAST_WON, HALVINGS = 0.01, 10
-"""Of χ²: a step that wins less moves nothing by more than a tenth of its standard deviation. Times that a step is
+"""Decrease of χ² below which a step moves nothing by more than a tenth of its standard deviation. Times that a step is
 halved: with four a descent over 15,000 poses that wrong loops had bent ended at four times the least χ².
 """
 TORN, SHARE_WON = 10.0, 1e-4
-"""χ² to a number that loops state, from where on these contradict each other, and the share of it that a step must win
-then: no poses make them fit.
+"""χ² per component of the loops' residuals beyond which loops contradict each other and no poses make them fit, and the
+share of χ² that a step must then gain.
 """
 
 
-def settled(fit: Fit, steps: int) -> Fit:
-    """The fit at the poses of least cost with the active loops, or after as many steps: until one would win less of χ²
-    than `LEAST_WON`, or where they contradict each other a small share. A step that wins nothing is halved.
+def optimised(fit: Fit, steps: int) -> Fit:
+    """The fit after up to `steps` of Gauss–Newton with halving, until the predicted decrease of χ² is below
+    `LEAST_WON`, or below `SHARE_WON` of χ² where loops contradict each other.
     """
     torn = TORN * len(fit.reduced.active) * len(fit.linear.chain.axes)
     for _ in range(steps if len(fit.reduced.active) else 0):
@@ -369,8 +379,10 @@ def settled(fit: Fit, steps: int) -> Fit:
 
 
 def from_rotations(bare: Fit, steps: int) -> Linear:
-    """The chain at poses that begin at the chordal rotations of the loops' ends, which need no start, after as many
-    steps: loops that contradict each other may take hundreds. `bare`: at the chain's own poses, where runs are edges.
+    """The chain at the poses of its reduced graph, solved from chordal rotations, which need no start.
+
+    `steps`: at most, as loops that contradict each other may take hundreds; `bare`: the fit at the chain's own poses,
+    where the motions of runs are edges.
     """
     chain, reduced, poses = bare.linear.chain, bare.reduced, bare.linear.poses[bare.reduced.ends]
     first, second = reduced.runs.T
@@ -382,16 +394,16 @@ def from_rotations(bare: Fit, steps: int) -> Linear:
     information[:, chain.axes[:, None], chain.axes] = of_axes
     graph = ViewGraph.from_edges(np.arange(len(poses)), reduced.network.edges, motion, information)
     found = solve(graph, start=poses, dimension=3 if chain.is_spatial else 2, max_iterations=steps)
-    return linearise(chain, bare.between(found.world_from_cam))
+    return linearise(chain, bare.with_ends(found.world_from_cam))
 
 
 LEAST_LEFT = 1e-6
-"""Of an edge's covariance, where rounding hides what the others say: it alone joins two parts."""
+"""Least eigenvalue of 1 − S⁻¹ K: less is rounding, of an edge that alone joins two parts."""
 
 
 def _without(own: Floats, across: Floats) -> Floats:
-    """`S (S − K)⁻¹ S` for the covariances S of edges and K of the same motions with all edges, S among them."""
-    factor = root(own)
+    """Leave-one-out covariances `S (S − K)⁻¹ S` (M, p, p): S of the edges alone, K of the same motions by all edges."""
+    factor = cholesky(own)
     inverse = np.linalg.inv(factor)
     values, vectors = np.linalg.eigh(inverse @ across @ np.swapaxes(inverse, 1, 2))
     left = np.maximum(1 - values, LEAST_LEFT)

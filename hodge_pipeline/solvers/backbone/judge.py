@@ -1,4 +1,4 @@
-"""Loops judged at some poses: the densities of their residuals, right and wrong, at poses solved without each."""
+"""Log-odds of loops: densities of their residuals, if right and if wrong, at poses solved without each."""
 
 from __future__ import annotations
 
@@ -6,71 +6,74 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hodge_pipeline.solvers.backbone.evidence import Wrong, student
-from hodge_pipeline.solvers.backbone.fit import Fit, Linear, root
+from hodge_pipeline.solvers.backbone.evidence import OutlierModel, student_log_density
+from hodge_pipeline.solvers.backbone.fit import Fit, Linear, cholesky
 from hodge_pipeline.types import Floats, Ints
 
 SAMPLES = 64
-"""Draws of the ends' errors: what they say of a standard deviation is off by a tenth."""
+"""Draws of the ends' errors, from which standard deviations are known to a tenth."""
 
 
 @dataclass(frozen=True)
 class Judged:
-    """Loops judged at some poses: `log_odds (M,)` that each is right, by all others; `factor (M,)` its log Bayes factor
-    without the share of right ones; `chi2 (M,)` of its residual at poses solved without it; `wrong (M,)`: the
-    log-density of its residual at hand if it is wrong.
+    """Loops judged at some poses, by all others.
+
+    - `factor (M,)`: log Bayes factor of each; `log_odds (M,)`: with the prior shares of right and wrong loops; both 0,
+      or the prior, where its ends are not connected.
+    - `chi2 (M,)`: of its residual at poses solved without it, NaN where its ends are not connected.
+    - `log_wrong (M,)`: the log-density of its residual at the poses if it is wrong.
     """
 
     log_odds: Floats
     factor: Floats
     chi2: Floats
-    wrong: Floats
+    log_wrong: Floats
 
 
-def judge(linear: Linear, fit: Fit | None, shares: Floats, wrong: Wrong) -> Judged:
-    """The loops at a fit, or at the bare chain."""
+def judge(linear: Linear, fit: Fit | None, shares: Floats, outliers: OutlierModel) -> Judged:
+    """The loops judged at the poses of a fit, or of the bare chain; `shares (2,)`: prior, of right and wrong loops."""
     covariance, residual = uncertainty(linear, fit), linear.loops[0].copy()
     if fit is not None and len(fit.reduced.active):
         active = fit.reduced.active
         residual[active], covariance[active] = fit.left_out(fit.reduced.of_loops)
     known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
-    (right, away), chi2 = np.zeros((2, len(covariance))), np.full(len(covariance), np.nan)
-    right[known], chi2[known] = student(residual[known], covariance[known])
-    away[known] = wrong.at(linear.chain, known, linear.loops[0][known]).log_density(covariance[known])
-    return Judged(right - away + np.log(shares[0] / shares[1]), right - away, chi2, away)
+    (right, log_wrong), chi2 = np.zeros((2, len(covariance))), np.full(len(covariance), np.nan)
+    right[known], chi2[known] = student_log_density(residual[known], covariance[known])
+    log_wrong[known] = outliers.at(linear.chain, known, linear.loops[0][known]).log_density(covariance[known])
+    return Judged(right - log_wrong + np.log(shares[0] / shares[1]), right - log_wrong, chi2, log_wrong)
 
 
 def uncertainty(linear: Linear, fit: Fit | None) -> Floats:
-    """The covariance (M, p, p) of each loop's residual at the poses of a fit; infinite where nothing tells."""
+    """The covariance (M, p, p) of each loop's residual at the poses of a fit, ∞ where its ends are not connected."""
     own = linear.loops[1]
-    out = _along(linear, np.arange(len(own)), np.inf)
+    out = _along_path(linear, np.arange(len(own)), np.inf)
     if fit is None or not len(fit.reduced.active):
         return out + own
-    through = _between(fit)
-    return np.asarray(np.where((_size(through) < _size(out))[:, None, None], through, out) + own)
+    through = _through_ends(fit)
+    return np.asarray(np.where((_trace(through) < _trace(out))[:, None, None], through, out) + own)
 
 
 def by_path(linear: Linear, rows: Ints) -> Floats:
-    """The covariance (K, p, p) of the residuals of these loops by the path between their ends; their own between two
-    paths.
+    """The covariance (K, p, p) of the residuals of loops (rows) along the bare chain; that of the loop alone where its
+    ends lie on two paths.
     """
-    return linear.loops[1][rows] + _along(linear, rows, 0.0)
+    return linear.loops[1][rows] + _along_path(linear, rows, 0.0)
 
 
-def _along(linear: Linear, rows: Ints, between: float) -> Floats:
-    """The covariance (K, p, p) of the path between the ends of these loops, `between` two paths this number."""
+def _along_path(linear: Linear, rows: Ints, otherwise: float) -> Floats:
+    """The covariance (K, p, p) of the path between the ends of loops (rows), `otherwise` between two paths."""
     a, b = linear.chain.ends[rows].T
     same = linear.chain.path[a] == linear.chain.path[b]
-    return np.where(same[:, None, None], linear.path(a, b), between)
+    return np.where(same[:, None, None], linear.path(a, b), otherwise)
 
 
-def _size(covariance: Floats) -> Floats:
+def _trace(covariance: Floats) -> Floats:
     with np.errstate(invalid="ignore"):
         return np.where(np.isfinite(covariance[:, 0, 0]), np.einsum("mii->m", covariance), np.inf)
 
 
-def _between(fit: Fit) -> Floats:
-    """The covariance of the motion between the ends of every loop by the nearest ends of active ones."""
+def _through_ends(fit: Fit) -> Floats:
+    """The covariance (M, p, p) of the motion between the ends of each loop, by the nearest ends of active ones."""
     linear, reduced, samples = fit.linear, fit.reduced, _samples(fit)
     chain, near, gap = linear.chain, [], np.zeros_like(linear.loops[1])
     for end in chain.ends.T:
@@ -105,6 +108,6 @@ BATCH = 500
 
 
 def _samples(fit: Fit) -> Floats:
-    """Moves (R, p, SAMPLES) of the ends drawn from their joint distribution: solves with noisy measurements."""
+    """Errors (R, p, SAMPLES) of the ends drawn from their joint distribution, by solves with noisy measurements."""
     size = (len(fit.precision), fit.precision.shape[-1], SAMPLES)
-    return fit.factor.solve(fit.force(root(fit.precision) @ np.random.default_rng(0).standard_normal(size)))
+    return fit.factor.solve(fit.force(cholesky(fit.precision) @ np.random.default_rng(0).standard_normal(size)))

@@ -1,4 +1,4 @@
-"""Steps that are stated more than once, as by the wheels and by a scan matcher: one backbone of their mean."""
+"""Parallel odometry edges, such as of wheels and of a scan matcher, fused into one edge for each step."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.complex.judging import has_unit_information, in_vertex_order, tail_gate
 from hodge_pipeline.solvers.backbone.chain import free_axes
-from hodge_pipeline.solvers.backbone.evidence import squares
+from hodge_pipeline.solvers.backbone.evidence import mahalanobis
 from hodge_pipeline.types import Bools, Ints, ViewGraph
 
 FEWEST = 10
-"""Steps that are stated again, from where on what they differ by tells how much is usual."""
+"""Fewest repeated steps whose differences are enough to estimate how much is usual."""
 
 
 @dataclass(frozen=True)
 class Fused:
-    """A graph with one edge for each step, in place of all that speak of it and agree.
+    """A graph with one edge for each step, fused from all that measure it and agree.
 
-    - `rows (E',)`: of its edges in the graph that was given; `part (N,)`: of edges there that are part of these;
-      `contradicted (K,)`: of those there that the others over the same steps speak against, in a step's place too.
+    Rows of the graph that was given: `rows (E',)` of its edges; `merged (N,)` of edges fused into these;
+    `contradicted (K,)` of edges, steps among them, that the others over the same steps contradict.
     """
 
     graph: ViewGraph
     rows: Ints
-    part: Ints
+    merged: Ints
     contradicted: Ints
 
 
-def fused(graph: ViewGraph, again: Bools) -> Fused:
-    """The graph with the mean, by information, in place of parallel edges among those that may state a step `again
-    (E,)`; one that differs from the first by more than one right edge among so many should stays an edge of its own.
+def fused(graph: ViewGraph, repeats: Bools) -> Fused:
+    """The graph in which parallel edges of `repeats (E,)` are replaced by their information-weighted mean; one whose
+    distance from the first exceeds the χ² gate stays an edge of its own.
     """
     whole, (i, j) = np.arange(graph.edge_count), np.sort(graph.edges, axis=1).T
-    rows = np.flatnonzero(again & (i != j))
+    rows = np.flatnonzero(repeats & (i != j))
     _, begin, group = np.unique((i * graph.vertex_count + j)[rows], return_index=True, return_inverse=True)
     first = rows[begin][group]
     second, first = rows[first != rows], first[first != rows]
@@ -44,7 +44,7 @@ def fused(graph: ViewGraph, again: Bools) -> Fused:
     axes, unknown, graph = free_axes(graph), has_unit_information(graph), in_vertex_order(graph)[0]
     apart = se3.log(se3.inverse(graph.i_from_j[first]) @ graph.i_from_j[second])
     both = se3.covariances(graph.information[np.concatenate([first, second])][:, axes[:, None], axes])
-    chi2 = squares(apart[:, axes], both[: len(first)] + both[len(first) :])[0]
+    chi2 = mahalanobis(apart[:, axes], both[: len(first)] + both[len(first) :])[0]
     usual = max(float(np.median(chi2)) / len(axes), np.finfo(float).eps if unknown else 1.0)
     agree = chi2 <= usual * tail_gate(len(axes), 1 / len(chi2))
     first, second, apart, information = first[agree], second[agree], apart[agree], graph.information[second[agree]]

@@ -1,8 +1,8 @@
-"""Which places of a chain are what their loops say, and which are mistaken for others.
+"""Which places of a chain are right, and which are mistaken for others (perceptual aliasing).
 
-Loops of one place agree also where it is mistaken: they are one testimony. Loops are judged by the poses that all used
-ones lead to, and mistaken places bend these until they fit, so that places are judged together: by the probability
-density of one loop of each in one Gauss–Newton solution, whose χ² counts how far the steps bend.
+Loops of one place agree also where it is mistaken: they count once. Mistaken places bend the poses of all used loops
+until they fit, so that places are judged together: by the probability density of one loop of each in one Gauss–Newton
+solution, whose χ² counts how far the steps bend.
 """
 
 from __future__ import annotations
@@ -13,43 +13,43 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import pdtrc
 
-from hodge_pipeline.solvers.backbone.breaks import Testimony
+from hodge_pipeline.solvers.backbone.breaks import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.chain import corridors, loops_at_place, one_of_each_place
-from hodge_pipeline.solvers.backbone.evidence import EVEN, Wrong, log_student, student
-from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, settled, thinned
+from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel, log_student, student_log_density
+from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, by_path, judge
 from hodge_pipeline.solvers.backbone.scales import decoys
 from hodge_pipeline.types import Bools, Floats, Ints
 
 MOST_STEPS = 15
-"""Of Gauss–Newton: a limit on cost."""
+"""Gauss–Newton steps: a limit on cost."""
 ALIKE = 0.75
-"""Of a place's loops: a used place of as many that contradicts it is its rival, as is an unused one of all as many."""
+"""Share of a place's loops that another used place must have to be its rival; an unused one needs as many loops."""
 MISTAKEN_PLACES = 0.2
-"""To each right one, of places that loops agree on, beside the rivals that are not used. With more
-a path that closes once would stay open: its loops can say little more than that the drift is as stated.
+"""Expected number of mistaken places to a right one, beside the rivals that are not used. With more, a path that closes
+once would stay open: its loops can show little more than that the drift is as stated.
 """
 ROUNDS = 6
-"""In which places that agree with the strongest are found: a limit on cost."""
+"""Rounds in which places that agree with the strongest are found: a limit on cost."""
 MOST_TRIED = 3
-"""Places that are left out, or added, on trial each time, and groups of loops that may be added: limits on cost."""
+"""Places left out or added on trial each time, and groups of loops that may be added: limits on cost."""
 CLEARLY = float(np.log(20.0))
-"""Log-odds that a change must win."""
+"""Log-odds that a change must gain."""
 FEW_UNUSED = 0.1
-"""Of the loops: with fewer, mistaken corridors are not reckoned with, and each place counts. Looked at on a walk all of
-whose loops are right, and on graphs of which four fifths or half are wrong, not between.
+"""Share of the loops that must be unused for the places of a corridor to count once; with fewer, each place counts.
+Looked at on a walk all of whose loops are right, and on graphs of which four fifths or half are wrong, not between.
 """
 PAIRED = 2
-"""Loops that random ones agree with at one place: three among thousands are rare."""
+"""Loops of one place that agree by chance at the most: three among thousands are rare."""
 CHANCES = 4000
-"""Loops between other places, at least, that say how often chance favours one so much."""
+"""Fewest random loops for the distribution of Bayes factors by chance."""
 MOST_PAIRS = 200_000
-"""Of loops that are compared: a limit on memory and time. All of 6000 at a few places took 2 GB and 22 CPU s."""
+"""Pairs of loops that are compared: a limit on memory and time. All of 6000 at a few places took 2 GB and 22 CPU s."""
 
 
 @dataclass(frozen=True)
 class Arrangement:
-    """Places taken for right (K,), the fit of one loop of each, and the log-odds that they are."""
+    """Places assumed right (K,), the fit with one loop of each, and the log-odds of this assumption."""
 
     right: Bools
     fit: Fit
@@ -58,16 +58,16 @@ class Arrangement:
 
 @dataclass(frozen=True)
 class Places:
-    """Places that the loops of a chain join; those that follow each other are one, as long as a corridor may be.
+    """Places that the loops of a chain join; adjacent ones are one, up to the length of a corridor.
 
-    - `start`: the bare chain. `loop (K,)`: one loop of each place, ascending; `bare (K,)`: the log Bayes factor of each
-      by itself; `size (K,)`: how many loops agree there; `used (K,)`: of used loops, not of unused ones that agree.
-    - `members (M,)`: the place of each used loop, and of the others in those groups; −1 elsewhere.
-    - `unused (G,)`: the sizes of all other groups of unused loops.
+    - `start`: the bare chain. `loop (K,)`: one loop of each place, ascending; `bare (K,)`: its log Bayes factor on the
+      bare chain; `size (K,)`: how many loops agree there; `used (K,)`: places of used loops, the others of unused ones.
+    - `members (M,)`: the place of each used loop and of each loop of an unused place; −1 elsewhere.
+    - `unused (G,)`: sizes of the other groups of unused loops.
     """
 
     start: Linear
-    wrong: Wrong
+    outliers: OutlierModel
     loop: Ints
     bare: Floats
     size: Floats
@@ -76,8 +76,8 @@ class Places:
     unused: Ints
 
     @classmethod
-    def of(cls, start: Linear, alone: Judged, used: Bools, wrong: Wrong) -> Places:
-        """Those of the used loops (M,), and of unused ones that agree the groups as large as is usual."""
+    def of(cls, start: Linear, alone: Judged, used: Bools, outliers: OutlierModel) -> Places:
+        """Places of the used loops (M,), and of the largest agreeing groups of unused ones, of at least median size."""
         ends, rows = start.chain.places, np.flatnonzero(used)
         place = rows[one_of_each_place(ends[rows])]
         distance, nearest = cKDTree(ends[place]).query(ends, p=np.inf)
@@ -87,7 +87,7 @@ class Places:
             run = corridors(ends[place])
         by_size = np.lexsort((-loops, run))
         first = by_size[np.unique(run[by_size], return_index=True)[1]]
-        groups = agreeing_groups(Testimony.of(start, alone.wrong), np.flatnonzero(distance > 1.0))
+        groups = agreeing_groups(PairwiseConsistency.of(start, alone.log_wrong), np.flatnonzero(distance > 1.0))
         usual = np.median(loops[first])
         may_be_added = np.array([len(group) >= usual and alone.factor[group[0]] > 0 for group in groups], bool)
         may_be_added[MOST_TRIED:] = False
@@ -100,7 +100,7 @@ class Places:
         order = np.argsort(loop)
         return cls(
             start,
-            wrong,
+            outliers,
             loop=loop[order],
             bare=alone.factor[loop[order]],
             size=size[order],
@@ -110,51 +110,51 @@ class Places:
         )
 
     def rivals(self, right: Bools) -> Floats:
-        """The logarithm (K,) of how many mistaken places of as many loops there are to each."""
+        """The logarithm (K,) of the expected number of mistaken places with as many loops as each has."""
         others = np.where(self.used, self.size / ALIKE, self.size)[~right]
         sizes = np.sort(np.concatenate([self.unused, others]))
         return np.asarray(np.log(len(sizes) - np.searchsorted(sizes, self.size) + MISTAKEN_PLACES))
 
     def chance(self, right: Bools) -> float:
-        """The logarithm of how probable it is that of all places as large, joined at random, as many as these (K,) say
-        as much by themselves: of the k of them that say most, for the k that is least probable. Impossible where more
-        than `PAIRED` loops agree at one: what these are mistaken for is among the rivals.
+        """The log-probability that places joined at random have Bayes factors as large as the `right (K,)` ones: of as
+        many of the strongest as is least probable, times the number of these choices. −∞ where more than `PAIRED` loops
+        agree at one place: mistakes of that kind are among the rivals.
         """
         if self.size[right].max() > PAIRED:
             return -np.inf
         chain = self.start.chain
         loop, ends = decoys(chain, -(-CHANCES // len(chain.ends)))
-        others = judge(linearise(chain.with_loops(loop, ends), self.start.poses), None, EVEN, self.wrong).factor
+        others = judge(linearise(chain.with_loops(loop, ends), self.start.poses), None, EVEN, self.outliers).factor
         strongest = np.flatnonzero(right)[np.argsort(-self.bare[right], kind="stable")]
         stronger = len(others) - np.searchsorted(np.sort(others), self.bare[strongest]) + 0.5
         sizes = np.sort(np.concatenate([self.size, self.unused]))
         as_large = len(sizes) - np.searchsorted(sizes, np.minimum.accumulate(self.size[strongest]))
-        tail = pdtrc(np.arange(len(strongest)), as_large * stronger / len(others))  # of Poisson's distribution
+        tail = pdtrc(np.arange(len(strongest)), as_large * stronger / len(others))  # Poisson
         return float(np.log(max(tail.min(), np.finfo(float).tiny)) + np.log(len(strongest)))
 
     def arranged(self, right: Bools, linear: Linear) -> Arrangement:
-        """These places (K,) taken for right, at the poses that are reached from some others."""
-        fit = settled(Fit(thinned(self.start.chain, self.loop[right]), linear), MOST_STEPS)
+        """The arrangement of these places (K,), optimised from the poses of `linear`."""
+        fit = optimised(Fit(thinned(self.start.chain, self.loop[right]), linear), MOST_STEPS)
         active = np.searchsorted(self.loop, fit.reduced.active)
-        # of what is expected beforehand, that of one counts
+        # without rivals MISTAKEN_PLACES counts once, not for each place
         prior = max(len(active) - 1, 0) * float(np.log(MISTAKEN_PLACES)) - float(self.rivals(right)[active].sum())
         return Arrangement(right, fit, self._density(fit) + prior)
 
     def _density(self, fit: Fit) -> float:
-        """The log-density of the active loops together, against all of them being wrong: of all in one Student's
-        distribution, since all errors may be larger than they are thought to be by one factor.
+        """The log-density of all active loops, against all being wrong: one Student's t for all, since all errors may
+        be larger than assumed by a common factor.
         """
         count = fit.reduced.active.size * len(self.start.chain.axes)
-        return float(log_student(fit.cost, count) - 0.5 * fit.log_det - self._away(fit).sum())
+        return float(log_student(fit.cost, count) - 0.5 * fit.log_det - self._log_wrong(fit).sum())
 
-    def _away(self, fit: Fit) -> Floats:
+    def _log_wrong(self, fit: Fit) -> Floats:
         """The log-density (L,) of each active loop if it is wrong."""
         rows = fit.reduced.active
-        return self.wrong.at(self.start.chain, rows, fit.loops[0]).log_density(by_path(self.start, rows))
+        return self.outliers.at(self.start.chain, rows, fit.loops[0]).log_density(by_path(self.start, rows))
 
     def best(self, linear: Linear, enough: float) -> tuple[Arrangement, bool]:
-        """The likeliest arrangement, from that of all used places on, whose poses are near `linear`, and whether its
-        log-odds are `enough`; where they are not, that from the place on which says most by itself.
+        """The likeliest arrangement, searched from all used places, whose poses are near `linear`, and, if its log-odds
+        are not `enough`, from the place with the strongest evidence; and whether its log-odds are enough.
         """
         found = self._improved(self.arranged(self.used, linear))
         if found.log_odds <= enough:
@@ -163,19 +163,19 @@ class Places:
         return found, found.log_odds > enough
 
     def _agreeing_with_strongest(self, enough: float) -> Bools:
-        """The place (K,) that says most by itself, and those that agree with it and each other."""
+        """The place with the strongest evidence by itself, and those (K,) that agree with it and each other."""
         by_itself = np.where(self.used, self.bare - self.rivals(self.used), -np.inf)
         right = strongest = np.arange(len(self.loop)) == np.argmax(by_itself)
         for _ in range(ROUNDS):
-            fit = settled(Fit(thinned(self.start.chain, self.loop[right]), self.start), MOST_STEPS)
-            factor = judge(fit.linear, fit, EVEN, self.wrong).factor[self.loop] - self.rivals(right)
+            fit = optimised(Fit(thinned(self.start.chain, self.loop[right]), self.start), MOST_STEPS)
+            factor = judge(fit.linear, fit, EVEN, self.outliers).factor[self.loop] - self.rivals(right)
             before, right = right, (self.used & (factor > enough)) | strongest
             if (before == right).all():
                 break
         return np.asarray(right)
 
     def _improved(self, found: Arrangement) -> Arrangement:
-        """The arrangement after places that bend it are left out and others added, while the log-odds rise."""
+        """The arrangement after leaving out or adding single places while the log-odds rise."""
         changes = self._changes(found)
         while changes:
             tried = self.arranged(changes.pop(0), found.fit.linear)
@@ -184,9 +184,8 @@ class Places:
         return found
 
     def _changes(self, found: Arrangement) -> list[Bools]:
-        """Arrangements (K,) that differ in one place and may be likelier: without one that is likelier mistaken by all
-        others, those that bend most first; with one more. None where there are more places than are solved together,
-        since other ones would be then.
+        """Arrangements (K,) that differ in one place and may be likelier: without one that the others contradict, the
+        largest χ² first; or with one more. None where not all places are active, since others would be then.
         """
         each, out = np.arange(len(self.loop)), list[Bools]()
         if len(found.fit.reduced.active) < found.right.sum():
@@ -194,27 +193,28 @@ class Places:
         if found.right.sum() > 1:
             active = np.searchsorted(self.loop, found.fit.reduced.active)
             residual, covariance = found.fit.left_out(found.fit.reduced.of_loops)
-            log_density, chi2 = student(residual, covariance)
-            worth = log_density - self._away(found.fit) - self.rivals(found.right)[active] + np.log(MISTAKEN_PLACES)
+            log_density, chi2 = student_log_density(residual, covariance)
+            log_odds = log_density - self._log_wrong(found.fit) - self.rivals(found.right)[active]
             bent = np.argsort(-chi2, kind="stable")
-            out = [found.right & (each != place) for place in active[bent[worth[bent] < 0][:MOST_TRIED]]]
+            doubtful = active[bent[(log_odds + np.log(MISTAKEN_PLACES))[bent] < 0][:MOST_TRIED]]
+            out = [found.right & (each != place) for place in doubtful]
         return out + [found.right | (each == place) for place in np.flatnonzero(~self.used & ~found.right)]
 
 
-def agreeing_groups(told: Testimony, rows: Ints) -> list[Ints]:
-    """Groups of these loops (K,), the largest first: each of one place, that agree with its first one as the steps
-    between their ends go. Where loops of a place contradict each other, few of them are one testimony. All those of a
-    place where there are too many to compare.
+def agreeing_groups(pairwise: PairwiseConsistency, rows: Ints) -> list[Ints]:
+    """Groups of loops `rows (K,)`, the largest first: of one place each, all of which agree with its first one.
+
+    Where there are more than `MOST_PAIRS` to compare, all loops of a place are one group.
     """
     if not len(rows):
         return []
-    ends = told.chain.places[rows]
+    ends = pairwise.chain.places[rows]
     tree = cKDTree(ends)
     if loops_at_place(ends).sum() > MOST_PAIRS:
         place = one_of_each_place(ends)
         return sorted((rows[tree.query_ball_point(ends[at], 1.0, p=np.inf)] for at in place), key=len, reverse=True)
     first, second = tree.query_pairs(1.0, p=np.inf, output_type="ndarray").T
-    pairs = np.stack([first, second], axis=1)[told.factor(rows[first], rows[second]) > 0]
+    pairs = np.stack([first, second], axis=1)[pairwise.factor(rows[first], rows[second]) > 0]
     both = np.concatenate([np.repeat(np.arange(len(rows)), 2).reshape(-1, 2), pairs, pairs[:, ::-1]])
     both = both[np.argsort(both[:, 0], kind="stable")]
     near = np.split(both[:, 1], np.cumsum(np.bincount(both[:, 0], minlength=len(rows)))[:-1])

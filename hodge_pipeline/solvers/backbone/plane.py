@@ -1,6 +1,4 @@
-"""Motions of the plane z = 0, as matrices (..., 4, 4), and their twists (..., 3) = (φ, x, y): as `se3` has it of all
-motions, in a third of the time.
-"""
+"""`se3` for motions (..., 4, 4) in the plane z = 0 and twists (..., 3) = (φ, x, y), in a third of the time."""
 
 from __future__ import annotations
 

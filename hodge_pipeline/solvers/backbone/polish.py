@@ -1,4 +1,4 @@
-"""The poses of the loops that are right, with heavy tails and for errors that are alike where loops are near."""
+"""The last solve: Student's t for loops, and correlated errors of steps and of loops at one place."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ import numpy as np
 
 from hodge_pipeline.complex.judging import tail_weight
 from hodge_pipeline.solvers.backbone.chain import loops_at_place
-from hodge_pipeline.solvers.backbone.evidence import squares
-from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, settled
+from hodge_pipeline.solvers.backbone.evidence import mahalanobis
+from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, optimised
 from hodge_pipeline.types import Floats
 
 LOCAL = 0.5
-"""Of the scale of the steps' errors over long paths, that over short ones: these errors are alike from step to step.
-Fitted, with the next, on the graphs of Bicocca and RobotCar.
+"""Scale of the steps' errors over short paths as a share of that over long ones, as these are correlated from step to
+step. Fitted, with the next, on the graphs of Bicocca and RobotCar.
 """
 CROWDED_POWER = 0.5
-"""The power of the number of loops at one place by which their variances are larger: 0 for errors that are independent,
-1 for the same error in all.
+"""Power of the number of loops at one place by which their variances grow: 0 for independent errors, 1 for the same
+error in all.
 """
 ROUNDS, STEPS = 5, 3
-"""Times that weights are taken anew, and Gauss–Newton's steps for each: limits on cost."""
+"""Reweighting rounds, and Gauss–Newton steps in each: limits on cost."""
 SAME_WEIGHT = 0.01
-"""Loops whose weights change by less are not solved for again."""
+"""Largest change of a weight at which reweighting ends."""
 
 
 def polished(reduced: Reduced, linear: Linear) -> tuple[Linear, Floats]:
-    """The chain at the poses of these active loops, and the factors (M,) on the standard deviations of all."""
+    """The chain at the poses of the active loops, and factors (M,) on the standard deviations of all loops."""
     chain, count, rows = linear.chain, len(linear.chain.ends), reduced.active
     if not len(rows):
         return linear, np.ones(count)
@@ -38,9 +38,9 @@ def polished(reduced: Reduced, linear: Linear) -> tuple[Linear, Floats]:
     weights = np.ones(count)
     for _ in range(ROUNDS):
         weighted = replace(chain, covariance=chain.covariance / weights[:, None, None])
-        fit = settled(Fit(reduced, replace(linear, chain=weighted)), STEPS)
+        fit = optimised(Fit(reduced, replace(linear, chain=weighted)), STEPS)
         linear, (residual, covariance) = fit.linear, fit.loops
-        chi2 = squares(residual, covariance * weights[rows, None, None])[0]
+        chi2 = mahalanobis(residual, covariance * weights[rows, None, None])[0]
         before = weights[rows]
         weights[rows] = tail_weight(chi2, len(chain.axes))
         if np.abs(weights[rows] - before).max() < SAME_WEIGHT:

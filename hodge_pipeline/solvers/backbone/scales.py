@@ -1,4 +1,4 @@
-"""By how much errors are larger than stated: learned from what the loops of a chain close to."""
+"""Scales of stated errors, learned from the closing errors of a chain's loops."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from hodge_pipeline.solvers.backbone.breaks import Testimony
+from hodge_pipeline.solvers.backbone.breaks import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.chain import MOST_OF_A_STEP, Chain
-from hodge_pipeline.solvers.backbone.evidence import EVEN, Wrong, WrongLoops, mixture, student
+from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel, OutlierResiduals, mixture, student_log_density
 from hodge_pipeline.solvers.backbone.fit import linearise
 from hodge_pipeline.types import Floats, Ints
 
 FOLD = np.log(4.0)
-"""Standard deviation of a scale's logarithm beforehand: stated information is seldom wrong by more."""
+"""Prior standard deviation of the logarithm of a scale: stated information is seldom wrong by more."""
 FIRST, FINEST = np.log(4.0), np.log(2.0) / 2
-"""Steps of the search, in the logarithm of a scale."""
+"""First and last step of the search, in the logarithm of a scale."""
 MOST_RATIO = np.log(2.0)
-"""Between the scales of rotation and of translation, where information is stated."""
+"""Largest log-ratio of the scales of rotation and of translation, where information is stated."""
 UNITS, TRIED = np.log(4.0) * np.array([-8, -7, -6, -5, -4, -3, -2, 2, 3, 4, 5, 6, 7, 8]), 3
-"""Logarithms of scales at which the search begins too, and how many of them, the likeliest. Where the information is
-the identity that stands for unknown, rotation and translation have each a unit of their own then.
+"""Further starts of the search, logarithms of a common scale, and how many of these, the likeliest, are searched. From
+them the scales of rotation and translation are independent where the information is the identity, for unknown.
 """
 FARTHEST = 3 * np.log(4.0)
-"""Where information is stated, the search begins at such units alone: one that is nearer explains mistaken places."""
+"""Least distance of further starts from the stated scale: nearer ones would explain mistaken places."""
 LIKELIER_BY = float(np.log(100.0))
-"""Nats by which loops must be likelier there."""
+"""Nats that a further start must gain over the stated scale."""
 DECOYS = 4
-"""To a loop: with one, scales of loops differed up to eightfold from one draw to the next."""
+"""Decoys per loop: with one, scales of loops differed up to eightfold from one draw to the next."""
 MOST_LOOPS = 3000
-"""That scales are learned from: more tell hardly more."""
+"""Loops that scales are learned from: more hardly change them."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Scales:
     loop_shift: float = 1.0
 
     def applied(self, chain: Chain) -> Chain:
-        """The chain with the covariances that follow."""
+        """The chain with scaled covariances, but for bridges."""
         step, loop = self.units(chain)
         return replace(
             chain,
@@ -54,41 +54,41 @@ class Scales:
             covariance=chain.covariance * np.outer(loop, loop),
         )
 
-    def surprise(self) -> float:
-        """How improbable it is beforehand that steps err by so much more than stated, in nats."""
+    def prior_cost(self) -> float:
+        """Minus the log-prior of the scales of steps above 1, in nats."""
         return float(0.5 * (np.log(np.maximum([self.step_turn, self.step_shift], 1.0)) ** 2).sum() / FOLD**2)
 
     def units(self, chain: Chain) -> tuple[Floats, Floats]:
         """The factor on each free axis (p,), of steps and of loops."""
-        split, size = chain.turns, len(chain.axes)
+        split, size = chain.rotation_axes, len(chain.axes)
         pairs = (self.step_turn, self.step_shift), (self.loop_turn, self.loop_shift)
         step, loop = (np.repeat(pair, (split, size - split)) for pair in pairs)
         return step, loop
 
 
-def learn_scales(chain: Chain, wrong: Wrong) -> tuple[Scales, Floats]:
-    """The scales at which the loops' residuals against the bare chain are likeliest, and the shares of right and wrong
-    loops.
+def learn_scales(chain: Chain, outliers: OutlierModel) -> tuple[Scales, Floats]:
+    """The most probable scales given the loops' residuals against the bare chain, and the shares (2,) of right and
+    wrong loops.
 
-    Each loop counts by itself: that loops at one place err alike, and steps too, would else be taken for small errors.
-    Decoys, motions of loops between other places, tell what as many would explain by chance at each scale. Of loops
-    between two paths, which may be joined, each is held against the one beside it.
+    Loops count as independent: correlated errors of loops at one place, and of steps, would else pass for small errors.
+    The log-likelihood of decoys, motions of loops between other places, is that of chance at each scale, and is
+    subtracted. A loop between two paths, which may not be joined, is compared with the one beside it.
     """
-    if chain.joins.any():  # as before, since beside what bridges allow for rounding hides how little steps err
+    if chain.joins.any():  # beside the covariance of bridges, that of steps is lost in rounding
         chain = chain.parted()
     poses = chain.poses
     alone = _within(chain, np.arange(len(chain.ends)), chain.ends)
     of_decoys = _within(chain, *decoys(chain, DECOYS))
     rows, ends = (np.concatenate(each) for each in zip(alone, of_decoys, strict=True))
-    models = _Model.within(chain.with_loops(rows, ends), poses, wrong)
+    models = _Model.within(chain.with_loops(rows, ends), poses, outliers)
     own, elsewhere = models.select(slice(len(alone[0]))), models.select(slice(len(alone[0]), None))
     both = [(own, elsewhere)]
     one, near = _neighbours(chain)
     if len(one):
         drawn = np.random.default_rng(2).integers(0, len(chain.ends), DECOYS * len(one))
-        by_chance = _Model.beside(chain, poses, wrong, np.repeat(one, DECOYS), np.repeat(near, DECOYS), drawn)
-        both.append((_Model.beside(chain, poses, wrong, one, near), by_chance))
-    most = _most(chain)
+        by_chance = _Model.beside(chain, poses, outliers, np.repeat(one, DECOYS), np.repeat(near, DECOYS), drawn)
+        both.append((_Model.beside(chain, poses, outliers, one, near), by_chance))
+    most = _upper_bounds(chain)
 
     def value(logs: Floats, unit: float) -> float:
         logs = np.minimum(logs, most)
@@ -111,13 +111,13 @@ def learn_scales(chain: Chain, wrong: Wrong) -> tuple[Scales, Floats]:
 
 
 def _beyond_chance(logs: Floats, own: _Model, elsewhere: _Model) -> float:
-    """The log-likelihood of scales beyond what decoys give as many cycles."""
+    """The log-likelihood of scales, less that of as many decoys."""
     share = len(own.residual) / max(len(elsewhere.residual), 1)
     return float(own.value(logs)[0] - share * max(elsewhere.value(logs)[0], 0.0))
 
 
 def _neighbours(chain: Chain) -> tuple[Ints, Ints]:
-    """Loops (K,) between two paths, and for each that loop between them whose ends are nearest to its own."""
+    """Loops (K,) between two paths, and for each the loop between the same two whose ends are nearest."""
     pairs = chain.path[chain.ends]
     rows = _some(np.flatnonzero(np.not_equal(*pairs.T)))
     if len(rows) < 2:
@@ -128,15 +128,15 @@ def _neighbours(chain: Chain) -> tuple[Ints, Ints]:
     return rows[same], other[same]
 
 
-def _most(chain: Chain) -> Floats:
-    """The logarithms (4,) of the largest scales. An odometry errs by no more than a share of what it moves, step by
-    step, unless it states more: else wrong loops that agree pass for right ones of an odometry that tells nothing.
-    Where something is stated, the error of rotation is bound to that of translation: who goes straight hardly turns.
+def _upper_bounds(chain: Chain) -> Floats:
+    """Upper bounds (4,) on the logarithms of scales. Steps err by no more than `MOST_OF_A_STEP` of their motion, unless
+    they state more: else wrong loops that agree pass for right ones of a useless odometry. Where information is stated,
+    rotations have no bound of their own, but `MOST_RATIO`: on a straight path their motion is small.
     """
     most = np.full(4, np.inf)
     steps = (chain.step_edge >= 0) & ~chain.bridged
     moved, spread = chain.log(chain.step[steps]), np.sqrt(np.einsum("mii->mi", chain.step_covariance[steps]))
-    for kind, axes in enumerate((slice(0, chain.turns), slice(chain.turns, None))):
+    for kind, axes in enumerate((slice(0, chain.rotation_axes), slice(chain.rotation_axes, None))):
         size, unit = np.linalg.norm(moved[:, axes]), np.linalg.norm(spread[:, axes])
         if size > 0 and unit > 0 and not (chain.stated and kind == 0):
             most[kind] = max(np.log(MOST_OF_A_STEP * size / unit), 0.0 if chain.stated else -np.inf)
@@ -144,7 +144,7 @@ def _most(chain: Chain) -> Floats:
 
 
 def _likeliest(value: Callable[[Floats, float], float], unit: float) -> tuple[Floats, float]:
-    """The logarithms (4,) of scales about that of a unit that have the largest value, and this."""
+    """The maximum of `value` by coordinate search from a common unit: the logarithms (4,) of scales, and the value."""
     best, width = np.full(4, unit), FIRST
     top = value(best, unit)
     while width >= FINEST:
@@ -163,7 +163,7 @@ def _likeliest(value: Callable[[Floats, float], float], unit: float) -> tuple[Fl
 
 
 def decoys(chain: Chain, times: int) -> tuple[Ints, Ints]:
-    """Each loop (K,), so many times, and two other places (K, 2) of one path, at random."""
+    """Each loop `times` over (K,), and random ends (K, 2) on one path for each."""
     rng = np.random.default_rng(1)
     loop = np.repeat(np.arange(len(chain.loop_edge)), times)
     first = rng.integers(0, chain.size, len(loop))
@@ -174,25 +174,27 @@ def decoys(chain: Chain, times: int) -> tuple[Ints, Ints]:
 
 
 def _within(chain: Chain, loop: Ints, ends: Ints) -> tuple[Ints, Ints]:
-    """Those of the loops within a path and their ends that scales are learned from."""
+    """Up to `MOST_LOOPS` of the loops (K,) whose ends (K, 2) lie on one path, and these ends."""
     rows = _some(np.flatnonzero(np.equal(*chain.path[ends].T)))
     return loop[rows], ends[rows]
 
 
 def _some(rows: Ints) -> Ints:
-    return (
-        rows if len(rows) <= MOST_LOOPS else np.sort(np.random.default_rng(0).choice(rows, MOST_LOOPS, replace=False))
-    )
+    if len(rows) <= MOST_LOOPS:
+        return rows
+    return np.sort(np.random.default_rng(0).choice(rows, MOST_LOOPS, replace=False))
 
 
 @dataclass(frozen=True)
 class _Model:
-    """Residuals (M, p) of cycles of one loop or two, with the covariances of their paths and of their loops as parts
-    (3, M, p, p): of rotation, of translation, and of both together; `fixed (M, p, p)`: what no scale changes; `away`:
-    where the loops lead if they are wrong.
+    """Closing errors of cycles of one loop or two, whose covariance is a quadratic function of the scales.
+
+    - `residual (M, p)`; `outliers`: the same if the loops are wrong.
+    - `path`, `own (3, M, p, p)`: the terms of rotation, of translation and of both in the covariances of the paths and
+      of the loops; `fixed (M, p, p)`: the term that no scale changes.
     """
 
-    away: WrongLoops
+    outliers: OutlierResiduals
     residual: Floats
     fixed: Floats
     path: Floats
@@ -202,13 +204,13 @@ class _Model:
     def of(
         cls,
         chain: Chain,
-        wrong: Wrong,
+        outliers: OutlierModel,
         rows: Ints,
         residual: Floats,
         parted: Callable[[Chain], tuple[Floats, Floats]],
     ) -> _Model:
-        """`rows (M,)`: the loops of the chain whose cycles these are; `parted` gives the covariances of paths and loops
-        where the chain has some errors.
+        """The model of the cycles of loops `rows (M,)`; `parted` gives the covariances of paths and of loops in a
+        chain.
         """
         kinds = (0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)
         parts = [parted(Scales(*kind, *kind).applied(chain)) for kind in kinds]
@@ -216,44 +218,45 @@ class _Model:
         fixed, path, own = path[0], path[1:] - path[0], own[1:]
         for each in (path, own):
             each[2] -= each[0] + each[1]
-        return cls(wrong.at(chain, rows, residual), residual, fixed, path, own)
+        return cls(outliers.at(chain, rows, residual), residual, fixed, path, own)
 
     @classmethod
-    def within(cls, chain: Chain, poses: Floats, wrong: Wrong) -> _Model:
-        """Of all loops of a chain and the path between the ends of each."""
+    def within(cls, chain: Chain, poses: Floats, outliers: OutlierModel) -> _Model:
+        """The cycle of each loop of a chain with the path between its ends."""
         linear = linearise(chain, poses)
 
         def parted(scaled: Chain) -> tuple[Floats, Floats]:
             part = replace(linear, chain=scaled)
             return part.path(*chain.ends.T), part.loops[1]
 
-        return cls.of(chain, wrong, np.arange(len(chain.ends)), linear.loops[0], parted)
+        return cls.of(chain, outliers, np.arange(len(chain.ends)), linear.loops[0], parted)
 
     @classmethod
     def beside(
-        cls, chain: Chain, poses: Floats, wrong: Wrong, one: Ints, other: Ints, drawn: Ints | None = None
+        cls, chain: Chain, poses: Floats, outliers: OutlierModel, one: Ints, other: Ints, drawn: Ints | None = None
     ) -> _Model:
-        """Of loops `one (M,)` of a chain beside `other (M,)` ones: of the paths between their lower ends and between
-        their upper ends. `drawn (M,)`: loops whose motions stand in place of the others'.
+        """The cycle of each loop `one (M,)` with a loop `other (M,)` and the paths between their lower ends and between
+        their upper ends. `drawn (M,)`: loops whose motions replace those of the others.
         """
         motions = np.concatenate([one, other if drawn is None else drawn])
         chain = chain.with_loops(motions, chain.ends[np.concatenate([one, other])])
         first, second = np.arange(2 * len(one)).reshape(2, -1)
         linear, none = linearise(chain, poses), np.zeros(len(motions))
 
-        def told(scaled: Chain) -> tuple[Floats, Floats]:
-            return Testimony.of(replace(linear, chain=scaled), none).against(second, first)
+        def residuals(scaled: Chain) -> tuple[Floats, Floats]:
+            return PairwiseConsistency.of(replace(linear, chain=scaled), none).residuals(second, first)
 
         def parted(scaled: Chain) -> tuple[Floats, Floats]:
-            path = told(replace(scaled, covariance=0 * scaled.covariance))[1]
-            return path, told(scaled)[1] - path
+            path = residuals(replace(scaled, covariance=0 * scaled.covariance))[1]
+            return path, residuals(scaled)[1] - path
 
-        return cls.of(chain, wrong, first, told(chain)[0], parted)
+        return cls.of(chain, outliers, first, residuals(chain)[0], parted)
 
     def select(self, rows: slice) -> _Model:
-        """That of these cycles."""
-        away = WrongLoops(self.away.along[rows], self.away.spread[rows], self.away.squared[rows], self.away.apart[rows])
-        return _Model(away, self.residual[rows], self.fixed[rows], self.path[:, rows], self.own[:, rows])
+        """The model of these cycles."""
+        away = self.outliers
+        outliers = OutlierResiduals(away.along[rows], away.spread[rows], away.squared[rows], away.apart[rows])
+        return _Model(outliers, self.residual[rows], self.fixed[rows], self.path[:, rows], self.own[:, rows])
 
     def value(self, logs: Floats) -> tuple[float, Floats]:
         """The log-likelihood of scales, against all loops being wrong, and the shares of right and wrong loops."""
@@ -261,7 +264,7 @@ class _Model:
             return 0.0, EVEN
         turn, shift, own_turn, own_shift = np.exp(logs)
         covariance = self.fixed + _weighed(self.path, turn, shift) + _weighed(self.own, own_turn, own_shift)
-        factor = student(self.residual, covariance)[0] - self.away.log_density(covariance)
+        factor = student_log_density(self.residual, covariance)[0] - self.outliers.log_density(covariance)
         shares, likelihood = mixture(factor)
         return likelihood, shares
 

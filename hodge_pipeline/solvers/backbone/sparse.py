@@ -21,17 +21,17 @@ from hodge_pipeline.solvers.elimination import (
 from hodge_pipeline.types import Floats, Ints
 
 MOST_NEIGHBOURS, FEWEST_IN_ROUND, SMALLEST_CORE = 24, 6, 64
-"""Of a vertex that is eliminated in a round, vertices of a round, and vertices that are inverted densely at once:
-rounds of fewer take longer.
+"""Most neighbours of a vertex that is eliminated in a round, fewest vertices of a round, and vertices of which a dense
+core is inverted at once: smaller rounds take longer.
 """
 
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """The pattern of the normal equations of vertices joined by edges (E, 2), one of each `component (N,)` held still.
+    """The sparsity pattern of the normal equations of edges (E, 2), with one vertex of each `component (N,)` fixed.
 
-    - `place (N,)`: of each vertex in the plan's order, those held still from `plan.size` on; `slot (E,)`: of each
-      edge's block above the diagonal, −1 where an end is held still.
+    `place (N,)`: the rank of each vertex in the elimination order, from `plan.size` on for fixed ones; `slot (E,)`:
+    each edge's block above the diagonal, −1 where an end is fixed.
     """
 
     edges: Ints
@@ -42,14 +42,14 @@ class NormalEquations:
 
     @classmethod
     def of(cls, edges: Ints, count: int) -> NormalEquations:
-        """That of these edges, none from a vertex to itself."""
+        """The pattern of edges between `count` vertices, without self-loops."""
         component = connected_components(edges, count)
         held = first_of_component(component)
         free = np.flatnonzero(~held)
         place = np.empty(count, np.int64)
         place[free], place[held] = np.arange(len(free)), np.arange(len(free), count)
         tail, head = place[edges].T
-        plan = plan_elimination(tail, head, len(free), _as_they_are, MOST_NEIGHBOURS, FEWEST_IN_ROUND, SMALLEST_CORE)
+        plan = plan_elimination(tail, head, len(free), _natural_order, MOST_NEIGHBOURS, FEWEST_IN_ROUND, SMALLEST_CORE)
         place[free[plan.order]] = np.arange(len(free))
         low, high = np.sort(place[edges], axis=1).T
         slot = np.where(high < len(free), np.searchsorted(plan.keys, low * len(free) + high), -1)
@@ -82,13 +82,13 @@ class NormalEquations:
         return Factored(self, carry, factor, core[0])
 
 
-def _as_they_are(pattern: csc_matrix) -> Ordering:
+def _natural_order(pattern: csc_matrix) -> Ordering:
     return Ordering(np.arange(pattern.shape[0]), 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Factored:
-    """A factorised network: `core` is what the rounds leave."""
+    """Factorised normal equations: `core` is the dense Schur complement that the rounds leave."""
 
     network: NormalEquations
     carry: Floats
@@ -103,7 +103,7 @@ class Factored:
         return (float(np.linalg.slogdet(self.core)[1]) if self.core.size else 0.0) - inverted
 
     def solve(self, force: Floats) -> Floats:
-        """The x (N, p, c) of forces (N, p, c); 0 where held still."""
+        """The solution x (N, p, c) for right-hand sides (N, p, c); 0 at fixed vertices."""
         network = self.network
         size = network.plan.size
         out, rhs = np.zeros_like(force), np.empty((size, *force.shape[1:]))

@@ -1,41 +1,51 @@
-"""What short cycles say of a backbone: whether they test its steps, which they contradict, which loops agree."""
+"""Short cycles of a backbone: whether they test its steps, which steps they contradict, which loops agree."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.chain import Chain, make_chain, sequential_edges
-from hodge_pipeline.solvers.backbone.evidence import squares
+from hodge_pipeline.solvers.backbone.evidence import mahalanobis
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 LOOPS_AT_A_STEP = 0.5
-"""From there on loops may make a lattice, or a room, in which no edge needs to be trusted."""
+"""Loops per step beyond which the graph may be a lattice, or a room, in which no edge needs to be trusted."""
 TESTED = 0.3
-"""Of the steps in short cycles that close: from there on every edge is judged, none trusted at first. On graphs of
-rooms .77 to .98 are, on those of places visited again 0 to .1, and as many as there are edges over two steps or three.
+"""Share of the steps in short cycles that close, beyond which every edge is judged and none trusted. On graphs of rooms
+.77 to .98 are, on those of places visited again 0 to .1, and as many as there are edges over two steps or three.
 """
 LONGEST_CYCLE = 3
-"""Steps of a cycle with one loop: cycles of several loops close too where these agree on a place that is wrong."""
+"""Most steps of a short cycle with one loop: cycles of several loops also close where all are wrong in one way."""
 OF_STEPS = 3.0
-"""Of the usual displacement and angle of steps: a cycle of right edges closes to less, and one of places at random
-seldom does.
-"""
+"""Divides the median displacement and angle of steps: cycles of right edges close to less, others seldom do."""
 
 
 def is_tested(chain: Chain) -> bool:
-    """Whether cycles of one loop that close to less than a step test so many steps that none needs to be trusted."""
+    """Whether short cycles of one loop that close pass over more than `TESTED` of the steps."""
     (low, high), poses = chain.ends.T, chain.poses
     short = np.flatnonzero((chain.path[low] == chain.path[high]) & (high - low <= LONGEST_CYCLE))
     closing = short[closes(chain.motion[short], _between(poses, low[short], high[short]), gate(chain))]
     return bool((chain.over(chain.ends[closing]) > 0).sum() > TESTED * (chain.step_edge >= 0).sum())
 
 
-def contradicted_from_afar(graph: ViewGraph, kept: Bools) -> tuple[int, int, int]:
-    """How many consecutive edges are not kept (E,) though nothing near contradicts them, how many are not kept, and how
-    many there are. Where one was measured wrong, kept edges over few of them tell, and two that begin beside it, one on
-    either side, whose other ends lie as near, where nothing is left out.
+class StepCounts(NamedTuple):
+    """How many steps are left out and no near loop contradicts, are left out, and are there."""
+
+    uncontradicted: int
+    left_out: int
+    steps: int
+
+
+def left_out_steps(graph: ViewGraph, kept: Bools) -> StepCounts:
+    """How many of the consecutive edges are not `kept (E,)`, and how many of these no near loop contradicts.
+
+    A step that was measured wrong is contradicted by a kept loop over few steps; or by a pair of kept loops whose lower
+    ends lie on either side of it, few steps apart, and whose upper ends are as near with no step left out between them,
+    or the other way round.
     """
     chain = make_chain(graph, sequential_edges(graph))
     inner = chain.step_edge >= 0
@@ -47,12 +57,13 @@ def contradicted_from_afar(graph: ViewGraph, kept: Bools) -> tuple[int, int, int
         low, high = np.diff(np.cumsum(left_out | ~inner)[two], axis=1)[:, 0].T
         near += [two[(low == 1) & (high == 0), :, 0], two[(low == 0) & (high == 1), :, 1]]
     out = inner & left_out
-    return int((out & (chain.over(np.concatenate(near)) == 0)).sum()), int(out.sum()), int(inner.sum())
+    uncontradicted = out & (chain.over(np.concatenate(near)) == 0)
+    return StepCounts(int(uncontradicted.sum()), int(out.sum()), int(inner.sum()))
 
 
 def agreeing_loops(chain: Chain, among: Bools) -> int:
-    """How many of these loops (M,) close a cycle with another of them and the steps between their neighbouring ends: to
-    less than a step, or within what the cycle's edges state.
+    """How many of these loops (M,) agree with a neighbour: their cycle with another one whose ends are at most a step
+    away closes within the gate, or within χ² by the covariance of its edges.
     """
     rows, poses = np.flatnonzero(among), chain.poses
     low, high = chain.ends[rows].T
@@ -69,18 +80,18 @@ def agreeing_loops(chain: Chain, among: Bools) -> int:
         spread = chain.covariance[rows[first]] + chain.covariance[rows[second]]
         spread = spread + (chain.step_covariance[low[second]] if down else 0.0)
         spread = spread + (chain.step_covariance[high[first] + max(up, 0)] if up else 0.0)
-        chi2 = squares(chain.log(se3.inverse(motion) @ ahead), spread)[0]
+        chi2 = mahalanobis(chain.log(se3.inverse(motion) @ ahead), spread)[0]
         closing = closes(motion, ahead, limits) | (chi2 < AS_STATED * len(chain.axes))
         out[first[closing]] = out[second[closing]] = True
     return int(out.sum())
 
 
 AS_STATED = 3.0
-"""χ² to an axis of a cycle that closes as its edges state: of right ones 4e-5 have more in space, 3 % in the plane."""
+"""χ² per axis of a cycle that closes: of right ones 4e-5 have more in space, 3 % in the plane."""
 
 
 def gate(chain: Chain) -> tuple[float, float]:
-    """Metres and radians to which cycles of right edges close."""
+    """The gate for closing errors of cycles of right edges: metres, radians."""
     inner = np.flatnonzero(chain.step_edge >= 0)
     shift = np.linalg.norm(chain.step[inner, :3, 3], axis=1)
     turn = se3.rotation_angle(chain.step[inner])
@@ -88,7 +99,7 @@ def gate(chain: Chain) -> tuple[float, float]:
 
 
 TURN_RAD = 0.1
-"""Where a backbone goes straight on, the angle that counts as a usual one."""
+"""Least angle of a step that counts as usual, for backbones that go straight on."""
 
 
 def _between(poses: Floats, a: Ints, b: Ints) -> Floats:
@@ -96,7 +107,7 @@ def _between(poses: Floats, a: Ints, b: Ints) -> Floats:
 
 
 def closes(motion: Floats, other: Floats, limits: tuple[float, float], widened: Floats | float = 1.0) -> Bools:
-    """Which motions (K, 4, 4) are the same as others but for so many times the metres and radians of `gate`."""
+    """Which motions (K, 4, 4) are within `limits` (metres, radians) times `widened` of the others."""
     left = se3.inverse(motion) @ other
     near = np.linalg.norm(left[:, :3, 3], axis=1) < limits[0] * widened
     return np.asarray(near & (se3.rotation_angle(left) < limits[1] * widened))

@@ -12,8 +12,8 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone.bridged import MOST_BREAKS, infer_bridged
 from hodge_pipeline.solvers.backbone.chain import (
     Chain,
-    believed,
     consecutive_edges,
+    credible_steps,
     linear_forest,
     make_chain,
     one_of_each_place,
@@ -33,32 +33,32 @@ from hodge_pipeline.types.text import counted
 
 AUTO, SEQUENTIAL, NONE = "auto", "sequential", "none"
 FEWEST_STEPS, MOST_PATHS = 10, 10
-"""Of a backbone that is looked for. Its paths have as many steps on average for each of the paths, up to as many, that
-loops must join: one path 10, ten or more 100.
+"""Of a backbone that `auto` looks for: its paths have on average at least this many steps times the number of paths, up
+to this many, since loops must join them: one path 10 steps, ten paths or more 100 each.
 """
 COVERED = 0.9
-"""Of the vertices that consecutive edges must join, so that a sequence is a backbone."""
+"""Share of the number of vertices that consecutive edges must reach, so that a sequence is a backbone."""
 AGREEING_REFUSED = 0.05
-"""Where loops are many: to each step, loops that the backbone refuses though they agree with each other, from where on
-it may be the backbone that is wrong: see `backbone_anyway`.
+"""Loops per step that the backbone refuses though they agree with each other, beyond which the backbone is in doubt,
+where loops are many: see `lattice_backbone`.
 """
 FEW_BREAKS = 3
-"""Of a backbone with as many loops: with these or more they judge each other, without the time that each takes."""
+"""Breaks of a backbone with many loops at which the search for more ends and the backbone is in doubt."""
 
 
 @dataclass(frozen=True)
 class Backbone:
-    """The edges that are trusted and what they say of the others.
+    """The trusted edges of a graph, and its other edges, the loops, judged on them.
 
-    - `steps`, `used (E,)`: edges of the backbone, and all that count: a step that does not is broken; `right (E,)`:
-      the probability of each loop, NaN for steps; `chi2 (E,)`: of each loop at the poses that the others lead to.
+    - `steps (E,)`: edges of the backbone; `used (E,)`: steps that are not broken, and loops that count.
+    - `right (E,)`: the probability of each loop, NaN for steps; `chi2 (E,)`: of each loop at poses solved without it.
     - `loop_width (M,)`: factors on the standard deviations of the chain's loops for the last solve.
-    - `part (E,)`: of `steps` those that state others of them again, one or several; `contradicted (E,)`: steps and
-      loops that do not count, since edges over the same steps contradict them.
+    - `merged (E,)`: steps that measure one or several other steps again; `contradicted (E,)`: steps and loops that do
+      not count, since edges over the same steps contradict them.
     - `world_from_cam (V, 4, 4)`: each path begins at the identity where no loop ties it.
-    - `doubted`: whether many loops agree with each other and not with the backbone, which may be what is wrong, or say
-      that it is broken at several steps.
-    - `named`: what its edges are called.
+    - `doubted`: whether many loops agree with each other and not with the backbone, or it is broken at several steps,
+      so that the backbone itself may be wrong.
+    - `named`: what notes call its edges.
     """
 
     chain: Chain
@@ -68,22 +68,22 @@ class Backbone:
     right: Floats
     chi2: Floats
     loop_width: Floats
-    part: Bools
+    merged: Bools
     contradicted: Bools
     world_from_cam: Floats
     doubted: bool
     named: str = "consecutive edges"
 
     def weighted(self, graph: ViewGraph) -> ViewGraph:
-        """The graph of the edges that count, with the information that their errors were found to have."""
+        """The graph of the used edges, with information scaled to the errors that were learned."""
         step, loop = self.found.scales.units(self.chain)
         width = np.ones((graph.edge_count, len(self.chain.axes)))
         width[self.steps] = step * LOCAL
-        if has_unit_information(graph):  # what states a step n times, or g steps, has as much less to say of one
+        if has_unit_information(graph):  # n measurements of a step, or one over g steps, weigh as much less each
             spans = self.chain.spans(graph.edges[self.steps])
             times = np.median(self.chain.over(spans)[self.chain.step_edge >= 0])
             width[self.steps] *= np.sqrt(times * np.diff(spans, axis=1))
-        graph, _ = believed(graph, self.steps)
+        graph, _ = credible_steps(graph, self.steps)
         width[self.chain.loop_edge] = loop * self.loop_width[:, None]
         whole = np.ones((graph.edge_count, 6))
         whole[:, self.chain.axes] = width
@@ -91,7 +91,7 @@ class Backbone:
         return replace(graph, information=information).select(np.flatnonzero(self.used))
 
     def places(self, edges: Bools) -> int:
-        """How many places these edges (E,) join: those of one place are one testimony, as `Chain.places` has it."""
+        """How many pairs of places these edges (E,) join; see `Chain.places`."""
         chain = self.found.scales.applied(self.chain)
         at = np.flatnonzero(chain.step_edge >= 0)
         ends = np.concatenate([chain.ends, np.stack([at - 1, at], axis=1)])
@@ -105,14 +105,14 @@ class Backbone:
 
     @property
     def note(self) -> str:
-        """What was trusted and what that led to."""
-        loops, used, more = len(self.chain.loop_edge), int(self.loops_used.sum()), int(self.part.sum())
-        again = f" and {more} that state the same steps again" if more else ""
-        trusted = f"{int(self.steps.sum()) - more} {self.named}{again} are trusted as a backbone"
+        """A line on which edges are trusted, and how many loops they confirm."""
+        loops, used, more = len(self.chain.loop_edge), int(self.loops_used.sum()), int(self.merged.sum())
+        repeated = f" and {more} that state the same steps again" if more else ""
+        trusted = f"{int(self.steps.sum()) - more} {self.named}{repeated} are trusted as a backbone"
         if not self.found.confirmed:
             return f"{trusted}, {counted(loops, 'loop')} that nothing confirms: the poses are the backbone's"
         broken = int((self.steps & ~self.used).sum())
-        said = f", {broken} of them called wrong by the others or the loops" if broken else ""
+        called_wrong = f", {broken} of them called wrong by the others or the loops" if broken else ""
         larger = max(self.found.scales.step_turn, self.found.scales.step_shift)
         if not self.chain.stated:
             errors = "; errors as loops show them, since the information lacks some"
@@ -120,35 +120,36 @@ class Backbone:
             errors = f"; these edges then err {larger:.2g} times what they state, or the loops are wrong alike"
         else:
             errors = ""
-        return f"{trusted}{said}, {used} of {loops} loops confirmed{errors}"
+        return f"{trusted}{called_wrong}, {used} of {loops} loops confirmed{errors}"
 
 
-def find_backbone(graph: ViewGraph, trust: str = AUTO, *, anyway: bool = False) -> Backbone | None:
-    """The backbone of a graph, None where it has none that should be trusted; `auto` takes none of a large lattice or
-    of a room, in which loops suffice, unless it is asked for one of these `anyway`, and of these alone: then one none
-    of whose steps is broken.
+def find_backbone(graph: ViewGraph, trust: str = AUTO, *, in_lattice: bool = False) -> Backbone | None:
+    """The backbone of a graph; None where it has none that should be trusted.
 
-    `trust`: `auto` learns from the graph whether its consecutive edges are one; `sequential` trusts them, `none` no
-    edge; any other word those edges whose `source` it is. Raises `GraphError` where no edge is meant.
+    - `trust`: `auto` learns from the graph whether its consecutive edges are a backbone, which those of a lattice or a
+      room are not; `sequential` trusts them, `none` no edge; any other word the edges of that `source`.
+    - `in_lattice`: the backbone, without breaks, of a lattice or a room, and None elsewhere.
+
+    Raises `GraphError` where there are no such edges.
     """
     if trust == NONE or not graph.edge_count:
         return None
     graph = replace(graph, dimension=2 if moves_in_plane(graph) else 3)
-    again = consecutive_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
-    if trust not in (AUTO, SEQUENTIAL):  # repeats of its other edges are loops, as these are
+    repeats = consecutive_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
+    if trust not in (AUTO, SEQUENTIAL):  # repeats of edges outside its paths are loops, as these edges are
         pair = np.sort(graph.edges, axis=1) @ [graph.vertex_count, 1]
-        again &= np.isin(pair, pair[_in_order(graph, again)])
-    one = fused(graph, again)
-    one = windowed(one) if trust in (AUTO, SEQUENTIAL) else one
-    backbone = _found(one.graph, trust, anyway)
+        repeats &= np.isin(pair, pair[_in_order(graph, repeats)])
+    single = fused(graph, repeats)
+    single = windowed(single) if trust in (AUTO, SEQUENTIAL) else single
+    backbone = _of_single_steps(single.graph, trust, in_lattice)
     if backbone is None:
         return None
     named = backbone.named if trust in (AUTO, SEQUENTIAL) else f"edges of {trust}"
-    return _of_all_edges(graph, replace(backbone, named=named), one)
+    return _of_all_edges(graph, replace(backbone, named=named), single)
 
 
-def _found(graph: ViewGraph, trust: str, anyway: bool) -> Backbone | None:
-    """The backbone of a graph that states each step once: see `find_backbone`."""
+def _of_single_steps(graph: ViewGraph, trust: str, in_lattice: bool) -> Backbone | None:
+    """The backbone of a graph with one edge for each step: see `find_backbone`."""
     chosen = sequential_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
     if trust == AUTO and chosen.sum() < max(FEWEST_STEPS, COVERED * graph.vertex_count):
         return None
@@ -162,23 +163,23 @@ def _found(graph: ViewGraph, trust: str, anyway: bool) -> Backbone | None:
     if trust == AUTO and steps.sum() < FEWEST_STEPS * min(paths, MOST_PATHS) * paths:
         return None
     many_loops = trust == AUTO and len(chain.loop_edge) > LOOPS_AT_A_STEP * steps.sum()
-    if anyway and not many_loops or not anyway and many_loops and is_tested(chain):
+    if in_lattice and not many_loops or not in_lattice and many_loops and is_tested(chain):
         return None
-    always = chosen[chain.loop_edge]  # of a source: those that make no paths
-    most = 0 if anyway else FEW_BREAKS if many_loops else MOST_BREAKS
-    inferred = infer_bridged(chain, always, anyway or not many_loops, most)
+    trusted = chosen[chain.loop_edge]  # edges of a trusted source that are in no path
+    most = 0 if in_lattice else FEW_BREAKS if many_loops else MOST_BREAKS
+    inferred = infer_bridged(chain, trusted, in_lattice or not many_loops, most)
     if inferred is None:
         return None
     chain, found = inferred
     broken = chain.broken.sum() >= FEW_BREAKS
     agree = agreeing_loops(found.scales.applied(chain), ~found.used) if many_loops else 0
     doubted = many_loops and bool(broken or agree > AGREEING_REFUSED * steps.sum())
-    if anyway or len(found.reduced.active) >= found.used.sum():
+    if in_lattice or len(found.reduced.active) >= found.used.sum():
         return _backbone(graph, chain, found, found.polished, steps, doubted)
-    trusted = steps.copy()
-    trusted[chain.loop_edge] = always
+    never_wrong = steps.copy()
+    never_wrong[chain.loop_edge] = trusted
     as_judged = found.linear, np.ones(len(found.used))
-    return of_every_loop(graph, _backbone(graph, chain, found, as_judged, steps, doubted), trusted)
+    return of_every_loop(graph, _backbone(graph, chain, found, as_judged, steps, doubted), never_wrong)
 
 
 def _of_source(graph: ViewGraph, source: str) -> Bools:
@@ -190,7 +191,7 @@ def _of_source(graph: ViewGraph, source: str) -> Bools:
 
 
 def _in_order(graph: ViewGraph, chosen: Bools) -> Bools:
-    """The paths among these edges (E,), of vertices that are neighbours by their ids first."""
+    """Edges (E,) among the chosen ones that make paths, those between neighbours in the order of ids first."""
     return linear_forest(vertex_ranks(graph)[graph.edges], graph.vertex_count, chosen)
 
 
@@ -210,20 +211,22 @@ def _backbone(
 
 
 def _of_all_edges(graph: ViewGraph, backbone: Backbone, one: Fused) -> Backbone:
-    """The backbone of the graph whose edges were fused: a part of steps counts where none of these is broken."""
+    """The backbone of the fused graph `one`, in rows of `graph`; a merged edge is used where none of its steps is
+    broken.
+    """
     chain, rows = backbone.chain, np.append(one.rows, -1)
     chain = replace(chain, step_edge=rows[chain.step_edge], loop_edge=one.rows[chain.loop_edge])
-    steps, used, part, contradicted = np.zeros((4, graph.edge_count), bool)
+    steps, used, merged, contradicted = np.zeros((4, graph.edge_count), bool)
     right, chi2 = np.full((2, graph.edge_count), np.nan)
     steps[one.rows], used[one.rows] = backbone.steps, backbone.used
     right[one.rows], chi2[one.rows] = backbone.right, backbone.chi2
-    part[one.part] = steps[one.part] = contradicted[one.contradicted] = True
+    merged[one.merged] = steps[one.merged] = contradicted[one.contradicted] = True
     used &= ~(steps & contradicted)
     contradicted &= ~used
-    low, high = chain.spans(graph.edges[one.part]).T
+    low, high = chain.spans(graph.edges[one.merged]).T
     broken = np.cumsum(chain.broken)
-    again = (high - low == 1) & contradicted[chain.step_edge[high]]
-    used[one.part], contradicted[one.part] = (broken[low] == broken[high]) & ~again, again
+    repeats = (high - low == 1) & contradicted[chain.step_edge[high]]
+    used[one.merged], contradicted[one.merged] = (broken[low] == broken[high]) & ~repeats, repeats
     return replace(
         backbone,
         chain=chain,
@@ -231,15 +234,16 @@ def _of_all_edges(graph: ViewGraph, backbone: Backbone, one: Fused) -> Backbone:
         used=used,
         right=right,
         chi2=chi2,
-        part=part,
+        merged=merged,
         contradicted=contradicted,
     )
 
 
 def of_every_loop(graph: ViewGraph, backbone: Backbone, trusted: Bools) -> Backbone:
-    """The backbone at the poses of all loops that count, where they were judged by some of them, with heavy tails where
-    one is off; a loop that is farther off than one right loop among so many should be counts no more, unless it is
-    among the `trusted (E,)` edges.
+    """The backbone at the poses of all used loops, solved with Student's t, where only some were active in judging
+    them.
+
+    A loop whose χ² exceeds that of one right loop among as many is dropped, unless it is `trusted (E,)`.
     """
     size, rows, weighted = len(backbone.chain.axes), np.flatnonzero(backbone.used), backbone.weighted(graph)
     rare = 1 / backbone.loops_used.sum()
@@ -259,8 +263,9 @@ def of_every_loop(graph: ViewGraph, backbone: Backbone, trusted: Bools) -> Backb
 
 
 MOST_SOLVED, TOLERANCE = 5, 1e-4
-"""Times that poses are solved for, each in seconds for 100,000 edges; and how precisely, of χ²."""
+"""Reweighted solves, each in seconds for 100,000 edges; and the relative tolerance of χ²."""
 SURPRISING = 2.5
-"""Times what steps state: larger errors are said. Right loops of 288 walks that err as stated ask for up to 2."""
+"""Learned scale of steps from which the note reports it. Right loops of 288 walks that err as stated ask for up to 2.
+"""
 UNUSED = 0.49
-"""The most probable that a loop which does not count is: too little speaks for it."""
+"""Largest probability that is reported of an unused loop."""

@@ -1,4 +1,4 @@
-"""Edges over a few steps, as of an odometry that registers each frame to several before it: one backbone of all."""
+"""Odometry with a window, each frame registered to several before it: its edges over a few steps fused into steps."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hodge_pipeline.solvers.backbone.chain import (
     sequential_edges,
     steps_apart,
 )
-from hodge_pipeline.solvers.backbone.evidence import squares
+from hodge_pipeline.solvers.backbone.evidence import mahalanobis
 from hodge_pipeline.solvers.backbone.fit import inverse, linearise
 from hodge_pipeline.solvers.backbone.judge import by_path
 from hodge_pipeline.solvers.backbone.parallel import Fused
@@ -32,55 +32,56 @@ from hodge_pipeline.solvers.reweighted import SETTLED
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 AGREEING = 0.9
-"""Of those edges, that agree with each other and the steps. Of edges between fragments of rooms, every pair of which
-was tried, .69 to .84 do, of the cubicle's .6; of graphs whose odometry has a window nearly all.
+"""Share of those edges that must agree with each other and the steps. Of edges between fragments of rooms, every pair
+of which was tried, .69 to .84 do, of the cubicle's .6; of graphs whose odometry has a window nearly all.
 """
 ROUNDS = 10
-"""Times that poses are solved for, while edges change sides: a limit on cost."""
+"""Reweighted solves: a limit on cost."""
 TOLERANCE, LEAST = 1e-4, 1e-9
-"""How precisely their poses are solved for, of χ²; and the least weight, so that they do not fall into pieces."""
+"""Relative tolerance of χ² of each solve, and the least weight of an edge, so that the graph stays connected."""
 
 
-def windowed(one: Fused) -> Fused:
-    """The graph with steps that say what the edges over a few of them do too, in place of these: where they are many
-    and nearly all of them agree. A step that they contradict is what they say of it.
+def windowed(given: Fused) -> Fused:
+    """The graph whose edges over a few steps are fused into the steps, if they are many and nearly all agree; else the
+    same. A step that they contradict is replaced by what they imply.
     """
-    graph = one.graph
+    graph = given.graph
     steps, apart = sequential_edges(graph), steps_apart(graph)
     if ((apart > 0) & (apart <= LONGEST_CYCLE)).sum() <= (1 + LOOPS_AT_A_STEP) * steps.sum():
-        return one  # nor need a chain be made for it
+        return given
     chain = make_chain(graph, steps)
     at, near = np.flatnonzero(chain.step_edge >= 0), _near(chain)
     if not _many(chain, near):
-        return one
+        return given
     unknown = has_unit_information(graph)
-    weights, poses = _agreeing(_as_they_close(chain, near) if unknown else chain, near)
+    weights, poses = _agreeing(_with_learned_covariance(chain, near) if unknown else chain, near)
     (of_step, of_near), agree = np.split(weights, [len(at)]), weights[len(at) :] > 0
     good = near[agree]
     if len(good) < AGREEING * len(near) or not _many(chain, good):
-        return one
+        return given
     replaced = (of_step == 0) & (chain.over(chain.ends[good]) > 0)[at]
     contradicted = np.concatenate([chain.step_edge[at[replaced]], chain.loop_edge[near[~agree]]])
-    told = replaced | (of_step > 0)
+    fused_steps = replaced | (of_step > 0)
     edges, motions, information = graph.edges.copy(), graph.i_from_j.copy(), graph.information.copy()
-    step = chain.step_edge[at[told]]
-    edges[step] = np.stack([chain.order[at[told] - 1], chain.order[at[told]]], axis=1)
-    motions[step] = se3.inverse(poses[at[told] - 1]) @ poses[at[told]]
+    to = at[fused_steps]
+    step = chain.step_edge[to]
+    edges[step] = np.stack([chain.order[to - 1], chain.order[to]], axis=1)
+    motions[step] = se3.inverse(poses[to - 1]) @ poses[to]
     if not unknown:
         own = np.zeros(chain.size)
         own[at] = of_step
         found = _information(chain, poses, own, good, of_near[agree])
         information[step] = 0.0
-        information[step[:, None, None], chain.axes[:, None], chain.axes] = found[at[told]]
+        information[step[:, None, None], chain.axes[:, None], chain.axes] = found[to]
     left = np.setdiff1d(np.arange(graph.edge_count), chain.loop_edge[near])
     fused = replace(graph, edges=edges, i_from_j=motions, information=information).select(left)
-    part = np.concatenate([one.part, one.rows[chain.loop_edge[good]]])
-    return Fused(fused, one.rows[left], part, one.rows[contradicted])
+    merged = np.concatenate([given.merged, given.rows[chain.loop_edge[good]]])
+    return Fused(fused, given.rows[left], merged, given.rows[contradicted])
 
 
 def _near(chain: Chain) -> Ints:
-    """Rows of the loops within a path over up to `STEPS_OF_PLACE` steps, or over more where at least half of all
-    positions have one over as many, and over each number below.
+    """Rows of the loops within a path over up to `STEPS_OF_PLACE` steps, or up to the longest window that at least
+    half of all positions have loops of each length of.
     """
     low, high = chain.ends.T
     same = chain.path[low] == chain.path[high]
@@ -90,22 +91,22 @@ def _near(chain: Chain) -> Ints:
 
 
 def _many(chain: Chain, rows: Ints) -> bool:
-    """Whether so many of these loops pass over two steps or three, and over so many steps, as a window has."""
+    """Whether loops (rows) over two or three steps are as many, and cover as many steps, as those of a window."""
     steps, ends = chain.step_edge >= 0, chain.ends[rows]
     short = ends[np.diff(ends, axis=1)[:, 0] <= LONGEST_CYCLE]
     many = len(short) > LOOPS_AT_A_STEP * steps.sum()
     return bool(many and (chain.over(short)[steps] > 0).sum() > TESTED * steps.sum())
 
 
-def _as_they_close(chain: Chain, near: Ints) -> Chain:
-    """The chain with errors as the `near` loops close, of rotation and of translation, in place of the identity that
-    stands for unknown information: half of what they close to of each, as many times a step's as it passes over.
+def _with_learned_covariance(chain: Chain, near: Ints) -> Chain:
+    """The chain with covariances from the closing errors of the `near` loops, in place of the identity that stands for
+    unknown information: half of the variance to the steps, and as many times a step's to a loop as it passes over.
     """
     ends, variance = chain.ends[near], np.empty(len(chain.axes))
-    squares = linearise(chain, chain.poses).loops[0][near] ** 2 / np.diff(ends, axis=1)
-    unit = float(np.mean(chain.log(chain.step)[:, chain.turns :] ** 2))
-    for kind, least in ((slice(0, chain.turns), 1.0), (slice(chain.turns, None), max(unit, EXACT))):
-        variance[kind] = max(np.median(squares[:, kind]) / MEDIAN_CHI2[1] / 2, EXACT**2 * least)
+    per_step = linearise(chain, chain.poses).loops[0][near] ** 2 / np.diff(ends, axis=1)
+    unit = float(np.mean(chain.log(chain.step)[:, chain.rotation_axes :] ** 2))
+    for kind, least in ((slice(0, chain.rotation_axes), 1.0), (slice(chain.rotation_axes, None), max(unit, EXACT))):
+        variance[kind] = max(np.median(per_step[:, kind]) / MEDIAN_CHI2[1] / 2, EXACT**2 * least)
     step, loop = np.zeros_like(chain.step_covariance), chain.covariance.copy()
     step[chain.step_edge >= 0] = np.diag(variance)
     loop[near] = np.diff(ends, axis=1)[:, :, None] * np.diag(variance)
@@ -113,12 +114,14 @@ def _as_they_close(chain: Chain, near: Ints) -> Chain:
 
 
 def _agreeing(chain: Chain, near: Ints) -> tuple[Floats, Floats]:
-    """The weights (N,) of all steps and then of the `near` loops, 0 of what does not agree, and the poses (n, 4, 4)
-    that they lead to. At first all count, but for loops that disagree with the chain over steps which others agree
-    with, and for steps that two or more speak against, and none for.
+    """Weights (N,) of all steps and then of the `near` loops, 0 for those that disagree; and the poses (n, 4, 4) of a
+    solve with Student's t.
+
+    It starts without loops that disagree with the chain over steps which other loops confirm, and without steps that
+    two loops or more contradict and none confirms.
     """
     linear, ends, size = linearise(chain, chain.poses), chain.ends[near], len(chain.axes)
-    chi2 = squares(linear.loops[0][near], by_path(linear, near))[0]
+    chi2 = mahalanobis(linear.loops[0][near], by_path(linear, near))[0]
     low, high = chain.poses[ends[:, 0]], chain.poses[ends[:, 1]]
     closing = closes(chain.motion[near], se3.inverse(low) @ high, gate(chain), np.sqrt(np.diff(ends, axis=1)[:, 0]))
     usual = chi2[closing | (chain.stated & (chi2 < AS_STATED * size))]
@@ -143,9 +146,8 @@ def _agreeing(chain: Chain, near: Ints) -> tuple[Floats, Floats]:
     )
 
     def solved(weights: Floats, start: Floats) -> Floats:
-        weighed = information * np.maximum(weights, LEAST)[:, None, None]
-        known = replace(graph, information=weighed)
-        return solve(known, start=start, initial="given", relative_tolerance=TOLERANCE).world_from_cam
+        weighted = replace(graph, information=information * np.maximum(weights, LEAST)[:, None, None])
+        return solve(weighted, start=start, initial="given", relative_tolerance=TOLERANCE).world_from_cam
 
     poses = solved(weights, chain.poses)
     for _ in range(ROUNDS):
@@ -158,9 +160,9 @@ def _agreeing(chain: Chain, near: Ints) -> tuple[Floats, Floats]:
 
 
 def _information(chain: Chain, poses: Floats, own: Floats, near: Ints, weights: Floats) -> Floats:
-    """The information (n, p, p) on the step to each position: its own with a weight (n,), and of the edges in rows
-    `near` with theirs an even share for each step. One over g steps states as much of each as g times its own: of many
-    steps they tell then as much as all edges together do.
+    """Information (n, p, p) on the step to each position: its own, with weights `own (n,)`, and a share of that of the
+    `near` loops over it, with theirs. A loop over g steps counts g times on each, so that over many steps the fused
+    steps have the information of all edges together.
     """
     low, high = chain.ends[near].T
     total = np.zeros_like(chain.step_covariance)
