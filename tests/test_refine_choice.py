@@ -10,7 +10,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.refine.candidates import Candidate, Found
-from hodge_pipeline.refine.choice import choose
+from hodge_pipeline.refine.choice import Choice, choose, refused_doubt
 from hodge_pipeline.refine.judge import costs
 from hodge_pipeline.refine.model import _loose_doubt, _metric_poses
 from hodge_pipeline.refine.uncertainty import loose, told_apart
@@ -75,6 +75,17 @@ def test_depth_held_out_refuses_what_tracks_alone_prefer() -> None:
     candidates = found(1.0, 0.3)
     assert choose(candidates, np.zeros((2, 0)), 0, NO_STEPS).row == 1
     assert choose(candidates, apart(0.01, 0.04), 0, NO_STEPS).row == 0
+
+
+def test_an_input_that_is_kept_beside_a_much_better_candidate_is_in_doubt() -> None:
+    no_depth, candidates = np.zeros((2, 0)), found(1.0, 0.3)
+    assert refused_doubt(candidates, Choice(0, "held out"), no_depth) == (
+        "in doubt, since bundle fits much better (1.00 → 0.30 px)"
+    )
+    assert refused_doubt(candidates, Choice(1, ""), no_depth) == ""
+    assert refused_doubt(candidates, Choice(0, "depth"), apart(0.01, 0.04)) == "", "depth refuses it"
+    assert refused_doubt(found(1.0, 0.8), Choice(0, "held out"), no_depth) == ""
+    assert refused_doubt(found(1.0, 0.45, points=230), Choice(0, "noise"), no_depth) == "", "noise alone is fitted"
 
 
 def test_depth_held_out_speaks_for_any_candidate() -> None:

@@ -76,6 +76,22 @@ def _best(found: Found, merging: Sequence[bool], distances_m: Floats) -> int:
     return at
 
 
+def refused_doubt(found: Found, choice: Choice, distances_m: Floats) -> str:
+    """A doubt where the input is kept though a candidate, which depth does not refuse, leaves less than half of its
+    cost.
+    """
+    at = _best(found, _merging(found), distances_m)
+    if choice.row or found.costs[0].px < FINEST_PX or not _gain(found, at) >= CLEAR_GAIN:
+        return ""
+    error = " → ".join(alike(found.costs[0].px, found.costs[at].px, 3))
+    return f"in doubt, since {found.candidates[at].name} fits much better ({error} px)"
+
+
+def _gain(found: Found, at: int) -> float:
+    """The share of the input's cost that a candidate saves, each as it would be were nothing fitted."""
+    return 1.0 - _per_freedom(found, at) / _per_freedom(found, 0, poses=False)
+
+
 def _per_freedom(found: Found, row: int, *, poses: bool = True) -> float:
     """The cost as it would be were nothing fitted: fewer points have less to fit noise with. Infinite where nothing
     is left over. Without `poses` as of poses that were measured by other means.
@@ -117,7 +133,7 @@ def _reason_to_keep(found: Found, at: int, seed: int, steps: Steps) -> str:
         return f"observations fit to {before.px:.2g} px, better than any keypoint is located"
     if after.doubt:
         return "no candidate fits the tracks: mend matches or cameras (--refine focal), or --force the best one"
-    gain = 1.0 - _per_freedom(found, at) / _per_freedom(found, 0, poses=False)
+    gain = _gain(found, at)
     if not gain >= LEAST_GAIN:
         fitted = f"{' → '.join(alike(before.px, after.px, 4))} px"
         return f"the best candidate's gain ({fitted}) is what so many poses gain by fitting noise"

@@ -18,7 +18,7 @@ LEAST_LEFT = 10
 
 
 def focal_doubt(model: TrackedModel, steps: Steps) -> str:
-    """Why poses may be wrong where bundle adjustment with free focal lengths fits much better; empty where it does not,
+    """Why poses may be wrong where an adjusted model fits much better with free focal lengths; empty where it does not,
     and where these are refined anyway.
     """
     left = 2 * len(model.quality.errors_px) - 3 * model.quality.points - 6 * len(model.body_names)

@@ -12,7 +12,7 @@ from hodge_pipeline.evaluation.difference import alike
 from hodge_pipeline.evaluation.trajectory import align
 from hodge_pipeline.executors.dask import open_workers
 from hodge_pipeline.refine.candidates import GIVEN, Found, weigh
-from hodge_pipeline.refine.choice import Choice, choose, held_out_score
+from hodge_pipeline.refine.choice import Choice, choose, held_out_score, refused_doubt
 from hodge_pipeline.refine.focal import focal_doubt
 from hodge_pipeline.refine.guard import Change, Decision, Measure
 from hodge_pipeline.refine.judge import SAME_COST, Cost, named
@@ -130,14 +130,19 @@ def _refine(
     if final.is_observable and not in_world:
         model, final = model.scaled(final.metres_per_unit), replace(final, metres_per_unit=1.0)
     change = _change(start, scales[0], model, in_world) if len(inputs) == 1 and at else None
-    decision = _placed_decision(start, found, choice) or _decision(found, choice, scales, force)
+    cost = found.costs[at]
+    doubt = (
+        focal_doubt(found.candidates[found.best].model, steps)
+        or cost.doubt
+        or cost.images_doubt
+        or refused_doubt(found, choice, distances_m)
+    )
+    doubt = doubt or (_loose_doubt(start, model) if at and not is_metric else "")
+    decision = _placed_decision(start, found, choice) or _decision(found, choice, scales, force, bool(doubt))
     measures = _measures(found, at, start, model, distances_m)
     names = [(one.name, cost) for one, cost in zip(found.candidates, found.costs, strict=True)]
     candidates = names if len(inputs) == 1 else [(f"{len(inputs)} models apart", found.inputs), *names]
     notes = (*model.notes, *found.notes, *(str(scale) for scale in scales))
-    cost = found.costs[at]
-    doubt = focal_doubt(chosen, steps) or cost.doubt or cost.images_doubt
-    doubt = doubt or (_loose_doubt(start, model) if at and not is_metric else "")
     doubt = ": ".join(filter(None, (final.doubt, doubt)))
     decision = replace(decision, measures=measures, change=change, doubt=doubt)
     kept = 0 if decision.keeps_input else at + len(candidates) - len(names)
@@ -161,7 +166,7 @@ def _placed_decision(start: TrackedModel, found: Found, choice: Choice) -> Decis
     return Decision("refined", f"{start.placing}{fit}; {told}")
 
 
-def _decision(found: Found, choice: Choice, scales: Sequence[Scale], force: bool) -> Decision:
+def _decision(found: Found, choice: Choice, scales: Sequence[Scale], force: bool, doubted: bool) -> Decision:
     """Whether the chosen candidate takes the place of the input."""
     before, after = found.costs[0], found.costs[choice.row]
     name = found.candidates[choice.row].name
@@ -171,7 +176,6 @@ def _decision(found: Found, choice: Choice, scales: Sequence[Scale], force: bool
     if scales[0].is_observable and not scales[0].is_one:
         return Decision("refined", f"in metres now; {told}")
     if not choice.row:
-        doubted = before.doubt or before.images_doubt
         return Decision(
             "worse" if before.doubt else "optimal", f"{'' if doubted else 'already optimal: '}{choice.reason}"
         )
