@@ -30,7 +30,7 @@ REACH_RANGES = 2.0
 VIEWS_APART, COMPARED = 3, 12
 """Least number of key frames between the earlier views that a view is compared with, so that their errors are
 independent; and how many, the nearest."""
-DRIFT_SHARE = 0.03
+LARGEST_DRIFT_SHARE = 0.03
 """Bound on drift as a share of the path since the last loop closure."""
 VOXEL_RANGES = 0.1
 """Least side, in median ranges, of the voxels in which overlap is measured: .2 m in a room."""
@@ -126,7 +126,7 @@ class _Path:
         options = self._options
         before = int(np.searchsorted(self._at_m, self._at_m[row] - LOOP_RANGES * self._range_m))
         way_m = self._ways(row, options.longest_way_m)[:before]
-        allowed_m = np.minimum(options.agree_m + DRIFT_SHARE * way_m, options.most_m)
+        allowed_m = np.minimum(options.agree_m + LARGEST_DRIFT_SHARE * way_m, options.most_m)
         shift_m = np.linalg.norm(self._poses[:before, :3, 3] - self._poses[row, :3, 3], axis=1)
         usable = np.flatnonzero(
             (shift_m < REACH_RANGES * self._range_m) & np.isfinite(way_m) & self._has_points[:before]
