@@ -134,6 +134,8 @@ def test_pieces_come_first_in_the_headline(
     assert verdict.headline.startswith(headline) and verdict.outcome == "improved"
     several = "pieces" in headline
     assert (verdict.pieces > 1) == several and verdict.mark == ("mixed" if several else "improved")
+    guessed = judge(replace(shown, notes=(*shown.notes, Note("left apart"))))
+    assert ("a guess joins" in guessed.headline) != several
     page, numbers = write_report(tmp_path, shown)
     assert headline in read_page(page)[0]
     assert json.loads(numbers.read_text("utf-8"))["verdict"]["sentence"].startswith(headline)

@@ -108,7 +108,8 @@ def judge(report: Report) -> Verdict:
     told = sorted(
         (*_unsettled(report), *_other_scale(report), *report.notes, *_wrong(report)), key=lambda note: note.rank
     )
-    reasons = " and ".join(REASONS[note.kind] for note in told if note.kind in REASONS)
+    apart = {"left apart"} if len(report.pieces) > 1 else set()  # then nothing joins them, and the headline says so
+    reasons = " and ".join(REASONS[note.kind] for note in told if note.kind in REASONS.keys() - apart)
     frames = report.source.frames
     doubts = [
         DOUBTS[note.kind].format(count=note.count, detail=note.detail, frames=frames)
