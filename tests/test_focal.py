@@ -26,6 +26,14 @@ def test_a_wrong_focal_length_is_told_with_the_right_one(tmp_path: Path, wrong: 
     assert focal.is_other == (wrong != 1.0)
 
 
+@pytest.mark.parametrize("speed", [0.0, 0.01, 0.1])
+def test_a_camera_that_hardly_moves_tells_no_other_focal_length(tmp_path: Path, speed: float) -> None:
+    poses, twists = shaken_views(tmp_path, 0.0, speed)
+    focal = estimate_focal(tmp_path, frames_of(CAMERA), poses, twists, 0.0, 1.0)
+    assert focal is not None and not focal.is_other
+    assert focal.high / focal.low > 1.05
+
+
 def test_a_read_out_that_is_known_does_not_bend_the_estimate(tmp_path: Path) -> None:
     poses, twists = shaken_views(tmp_path, 0.0225)
     known, ignored = (

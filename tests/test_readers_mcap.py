@@ -251,11 +251,14 @@ def test_calibrations_that_do_not_fit(tmp_path: Path) -> None:
     assert f"{INFO}: intrinsics of {2 * WIDTH}x{2 * HEIGHT} are scaled to the images' {WIDTH}x{HEIGHT}" in scaled.notes
 
 
-def test_calibrations_of_another_shape_are_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("height", [400, 0])
+def test_calibrations_of_another_shape_are_named(tmp_path: Path, height: int) -> None:
     log = Log()
     log.add(DEPTH, RAW, {**foxglove_header(100, OPTICAL), **some_images(1)[0]}, CDR)
-    log.add(INFO, CALIBRATION, {**foxglove_header(100, OPTICAL), **calibration(640, 400, 500, 500, 320, 200)}, CDR)
-    with pytest.raises(SourceError, match=f"no calibration .*8x6 images of {DEPTH}: there is {INFO} 640x400: give"):
+    log.add(INFO, CALIBRATION, {**foxglove_header(100, OPTICAL), **calibration(640, height, 500, 500, 320, 200)}, CDR)
+    with pytest.raises(
+        SourceError, match=f"no calibration .*8x6 images of {DEPTH}: there is {INFO} 640x{height}: give"
+    ):
         McapReader().open(log.write(tmp_path / "size.mcap"))
     with pytest.raises(
         SourceError,

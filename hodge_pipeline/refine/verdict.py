@@ -182,13 +182,11 @@ def _settled(work: Work, rounds: Sequence[Round]) -> list[Measure]:
     """How far the last round still moved the poses, beside what it may; empty where they have settled."""
     last = rounds[-1]
     component = connected_components(last.graph.edges, last.graph.vertex_count)
-    shift_m, limit_m = (
-        last_shift_m(rounds, component),
-        settled_m(last.world_from_cam[:, :3, 3], float(work.recipe.scale)),
-    )
+    limit_m = settled_m(last.world_from_cam[:, :3, 3], float(work.recipe.scale))
+    shift_m = last_shift_m(rounds, component)
     if shift_m is None or shift_m <= limit_m:
         return []
-    return [Measure("movement in the last round, and what it may be", limit_m, shift_m, unit="m")]
+    return [Measure("movement that the last round may make, and made", limit_m, shift_m, unit="m")]
 
 
 def first_as_good(scores: Floats) -> int:

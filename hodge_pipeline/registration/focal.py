@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.readout import with_readout
+from hodge_pipeline.registration.readout import FEWEST_KEYS, INTERVAL, drawn_keys, with_readout
 from hodge_pipeline.registration.reposing import view_at_stamps
 from hodge_pipeline.registration.resection import focal_evidence, resect
 from hodge_pipeline.registration.sightings import views
@@ -20,9 +20,6 @@ MOST_VIEWS = 50
 """Views used, evenly spread: each takes 8 CPU ms."""
 ROUNDS = 3
 """Gauss–Newton steps on log f: with a focal length 25 % off the last one moves it by 2 %."""
-FEWEST_KEYS = 5
-"""Key frames that the bootstrap of the interval needs: it draws key frames, since views of one share its errors."""
-DRAWS = 500
 OTHER = 0.07
 """Of log f: a right camera may be so far off where depth and colour are not calibrated to each other. Of fr1/rpy,
 fr1/xyz and two parts of red kitchen 0.02, 0.01, 0.01 and 0.06 are found.
@@ -60,15 +57,14 @@ def estimate_focal(
     camera = with_readout(camera, readout_s)
     poses = [se3.inverse(world_from_cam[view.key]) @ world_from_cam[view.row] for view in chosen]
     stamped = [view_at_stamps(view, camera, frames, twists, pose) for view, pose in zip(chosen, poses, strict=True)]
-    drawn = np.random.default_rng(0).integers(0, len(keys), (DRAWS, len(keys)))
-    log = 0.0
+    drawn, log = drawn_keys(len(keys)), 0.0
     for _ in range(ROUNDS):
         evidence = _evidence(stamped, poses, camera, log, unit_m)
         of_key = np.array([evidence[rows].sum(axis=0) for _, rows in keys])
         gradient, information = of_key[drawn].sum(axis=1).T
         if not information.all():
             return None
-        low, high = camera.fx * np.exp(log + np.quantile(gradient / information, [0.01, 0.99]))
+        low, high = camera.fx * np.exp(log + np.quantile(gradient / information, INTERVAL))
         log += float(evidence[:, 0].sum() / evidence[:, 1].sum())
     return Focal(camera.fx, camera.fx * float(np.exp(log)), float(low), float(high))
 

@@ -12,7 +12,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.registration.reposing import view_at_stamps
 from hodge_pipeline.registration.resection import resect, robust_cost
 from hodge_pipeline.registration.sightings import View, views
-from hodge_pipeline.types import Camera, Floats, Frame
+from hodge_pipeline.types import Camera, Floats, Frame, Ints
 from hodge_pipeline.types.arrays import evenly, groups
 
 TRIED_S = np.linspace(0.0, 0.035, 8)
@@ -26,7 +26,8 @@ MOST_VIEWS = 100
 """Views used, evenly spread: each takes 10 CPU ms."""
 FEWEST_KEYS = 5
 """Key frames that the bootstrap of the interval needs: it draws key frames, since views of one share its errors."""
-DRAWS = 500
+DRAWS, INTERVAL = 500, (0.01, 0.99)
+"""Draws of the bootstrap, and the quantiles of its interval."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,11 @@ class Readout:
     best_s: float
     low_s: float
     high_s: float
+
+
+def drawn_keys(count: int) -> Ints:
+    """Rows (DRAWS, count) of so many key frames, drawn with replacement."""
+    return np.random.default_rng(0).integers(0, count, (DRAWS, count))
 
 
 def with_readout(camera: Camera, readout_s: float) -> Camera:
@@ -86,9 +92,8 @@ def _minimum(costs: Floats) -> Readout | None:
     """The time of least total cost (K, T), its interval by bootstrap over the K key frames; None where unclear."""
     if len(costs) < FEWEST_KEYS:
         return None
-    drawn = np.random.default_rng(0).integers(0, len(costs), (DRAWS, len(costs)))
-    lowest = [_vertex(costs[rows].sum(axis=0)) for rows in drawn]
-    low, high = np.quantile(lowest, [0.01, 0.99]).tolist()
+    lowest = [_vertex(costs[rows].sum(axis=0)) for rows in drawn_keys(len(costs))]
+    low, high = np.quantile(lowest, INTERVAL).tolist()
     best = _vertex(costs.sum(axis=0))
     clear = low >= SHORTEST_S and high <= LONGEST_S and high - low <= WIDEST * best
     return Readout(best, low, high) if clear else None

@@ -95,8 +95,9 @@ def read_whole_image(path: Path, size: tuple[int, int] | None = None, any_scale:
 
 
 def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether images of these (width, height) have the same aspect ratio, to within `SAME_SHAPE`."""
-    return abs(one[0] * other[1] / (one[1] * other[0]) - 1) <= SAME_SHAPE
+    """Whether images of these (width, height) have the same aspect ratio, to within `SAME_SHAPE`; none has that of 0."""
+    across, down = one[0] * other[1], one[1] * other[0]
+    return across > 0 and abs(across - down) <= SAME_SHAPE * down
 
 
 def image_size(path: Path) -> tuple[int, int]:

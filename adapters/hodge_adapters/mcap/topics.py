@@ -146,7 +146,8 @@ def _camera(name: str, calibration: Calibration, topic: str, layout: ImageLayout
     p, k = calibration.p, calibration.k
     is_rectified = "rect" in image_base(topic).rpartition("/")[2] and bool(p) and p[0] > 0 and p[5] != 0
     fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if is_rectified else (k[0], k[4], k[2], k[5])
-    size = calibration.width or layout.width, calibration.height or layout.height
+    told = calibration.width, calibration.height
+    size = told if any(told) else layout.size
     if not same_shape(size, layout.size):
         raise SourceError(
             f"{name}: calibrates {size[0]}x{size[1]} images, those of {topic} are {_size(layout)}: "
