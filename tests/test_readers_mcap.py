@@ -262,7 +262,7 @@ def test_calibrations_of_another_shape_are_named(tmp_path: Path, height: int) ->
         McapReader().open(log.write(tmp_path / "size.mcap"))
     with pytest.raises(
         SourceError,
-        match="calibrates 640x400 images, those of /cam/depth/image are 8x6: give --set source.reader.camera=",
+        match=f"calibrates 640x{height} images, those of /cam/depth/image are 8x6: give --set source.reader.camera=",
     ):
         McapReader(calibration_topic=INFO).open(tmp_path / "size.mcap")
 

@@ -95,7 +95,7 @@ def read_whole_image(path: Path, size: tuple[int, int] | None = None, any_scale:
 
 
 def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether images of these (width, height) have the same aspect ratio, to within `SAME_SHAPE`; none has that of 0."""
+    """Whether images of these (width, height) have the same aspect ratio, to within `SAME_SHAPE`; no side is 0."""
     across, down = one[0] * other[1], one[1] * other[0]
     return across > 0 and abs(across - down) <= SAME_SHAPE * down
 
