@@ -12,7 +12,8 @@ import pytest
 
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.refine.pose_graph import read_graph
-from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, linearise
+from hodge_pipeline.solvers.backbone.fit import Fit, Reduced
+from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.places import Arrangement, Places
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from tests.backbone_graphs import Drive, at_one_place, drive, two_laps

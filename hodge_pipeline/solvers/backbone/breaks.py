@@ -12,7 +12,8 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.judging import FREEDOM, tail_weight
 from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis, student_log_density
-from hodge_pipeline.solvers.backbone.fit import Fit, Linear, cholesky, linearise, shifted, turned
+from hodge_pipeline.solvers.backbone.fit import Fit
+from hodge_pipeline.solvers.backbone.linear import Linear, cholesky, linearise, shifted, turned
 from hodge_pipeline.types import Bools, Floats, Ints
 
 NEIGHBOURS, SEEDS = 8, 16

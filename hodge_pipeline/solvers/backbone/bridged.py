@@ -20,7 +20,7 @@ from hodge_pipeline.solvers.backbone.breaks import (
 )
 from hodge_pipeline.solvers.backbone.chain import Chain, linked, loops_at_place
 from hodge_pipeline.solvers.backbone.evidence import OutlierModel, mixture, student_log_density
-from hodge_pipeline.solvers.backbone.fit import Fit, linearise, optimised
+from hodge_pipeline.solvers.backbone.fit import Fit, optimised
 from hodge_pipeline.solvers.backbone.inference import (
     BY_CHANCE,
     MISTAKEN,
@@ -30,6 +30,7 @@ from hodge_pipeline.solvers.backbone.inference import (
     refused,
 )
 from hodge_pipeline.solvers.backbone.judge import by_path
+from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.places import MISTAKEN_PLACES, MOST_STEPS, agreeing_groups
 from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales
 from hodge_pipeline.types import Bools, Ints

@@ -9,7 +9,7 @@ from scipy.special import gammaln
 
 from hodge_pipeline.complex.judging import FREEDOM
 from hodge_pipeline.solvers.backbone.chain import Chain
-from hodge_pipeline.solvers.backbone.fit import cholesky, motion_residuals
+from hodge_pipeline.solvers.backbone.linear import cholesky, motion_residuals
 from hodge_pipeline.types import Bools, Floats, Ints
 
 PAIRS, FEWEST_PAIRS = 4000, 200

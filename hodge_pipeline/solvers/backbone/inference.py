@@ -12,8 +12,9 @@ from scipy.special import expit
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place, one_of_each_place
 from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel, mixture
-from hodge_pipeline.solvers.backbone.fit import Fit, Linear, Reduced, from_rotations, linearise, optimised, thinned
+from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, from_rotations, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, judge
+from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.places import MOST_STEPS, MOST_TRIED, Places
 from hodge_pipeline.solvers.backbone.polish import polished
 from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales

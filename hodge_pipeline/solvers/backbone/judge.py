@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline.solvers.backbone.evidence import OutlierModel, student_log_density
-from hodge_pipeline.solvers.backbone.fit import Fit, Linear, cholesky
+from hodge_pipeline.solvers.backbone.fit import Fit
+from hodge_pipeline.solvers.backbone.linear import Linear, cholesky
 from hodge_pipeline.types import Floats, Ints
 
 SAMPLES = 64

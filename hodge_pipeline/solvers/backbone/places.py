@@ -16,8 +16,9 @@ from scipy.special import pdtrc
 from hodge_pipeline.solvers.backbone.breaks import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.chain import corridors, loops_at_place, one_of_each_place
 from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel, log_student, student_log_density
-from hodge_pipeline.solvers.backbone.fit import Fit, Linear, linearise, optimised, thinned
+from hodge_pipeline.solvers.backbone.fit import Fit, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, by_path, judge
+from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.scales import decoys
 from hodge_pipeline.types import Bools, Floats, Ints
 

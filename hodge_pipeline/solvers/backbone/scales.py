@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from hodge_pipeline.solvers.backbone.breaks import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.chain import MOST_OF_A_STEP, Chain
 from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel, OutlierResiduals, mixture, student_log_density
-from hodge_pipeline.solvers.backbone.fit import linearise
+from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.types import Floats, Ints
 
 FOLD = np.log(4.0)

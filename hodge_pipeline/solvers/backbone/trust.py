@@ -20,8 +20,8 @@ from hodge_pipeline.solvers.backbone.chain import (
     sequential_edges,
     vertex_ranks,
 )
-from hodge_pipeline.solvers.backbone.fit import Linear
 from hodge_pipeline.solvers.backbone.inference import Inferred
+from hodge_pipeline.solvers.backbone.linear import Linear
 from hodge_pipeline.solvers.backbone.parallel import Fused, fused
 from hodge_pipeline.solvers.backbone.polish import LOCAL
 from hodge_pipeline.solvers.backbone.step_tests import LOOPS_AT_A_STEP, agreeing_loops, is_tested

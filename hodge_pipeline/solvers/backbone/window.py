@@ -23,8 +23,8 @@ from hodge_pipeline.solvers.backbone.chain import (
     steps_apart,
 )
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis
-from hodge_pipeline.solvers.backbone.fit import inverse, linearise
 from hodge_pipeline.solvers.backbone.judge import by_path
+from hodge_pipeline.solvers.backbone.linear import inverse, linearise
 from hodge_pipeline.solvers.backbone.parallel import Fused
 from hodge_pipeline.solvers.backbone.step_tests import AS_STATED, LONGEST_CYCLE, LOOPS_AT_A_STEP, TESTED, closes, gate
 from hodge_pipeline.solvers.maximum_likelihood import solve
