@@ -18,7 +18,7 @@ from scipy.linalg import eigh
 from scipy.sparse import coo_matrix, csr_matrix, kron
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.judging import residual_twists
+from hodge_pipeline.complex.chi2 import residual_twists
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 MOST_PIECES = 96

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.chi2 import chi2_by_information
 from hodge_pipeline.complex.components import by_size, connected_components
-from hodge_pipeline.complex.judging import chi2_by_information
 from hodge_pipeline.solvers.bending import Bending, Bent
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.setup import NO_ROWS

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hodge_pipeline.complex.judging import chi2_by_information, student_weight
+from hodge_pipeline.complex.chi2 import chi2_by_information, student_weight
 from hodge_pipeline.solvers.weights import dimension_of
 from hodge_pipeline.types import Floats, Solution, ViewGraph
 

@@ -73,7 +73,7 @@ def squares_at_both_ends(i_from_j: Floats, xi: Floats) -> tuple[Floats, Floats]:
 
 
 def _i_origin_in_j(i_from_j: Floats) -> Floats:
-    """Frame i's origin (E, 3) in j's axes: residuals of translation at i are taken there."""
+    """Frame i's origin (E, 3) in frame j: residuals of translation at i are taken there."""
     return np.asarray(-np.einsum("eji,ej->ei", i_from_j[:, :3, :3], i_from_j[:, :3, 3]))
 
 
