@@ -39,10 +39,10 @@ FIRST_SHIFT = 1e-3
 
 @dataclass(frozen=True)
 class Certificate:
-    """The answer: `optimal`, with every eigenvalue ≥ −shift and `gap_bound` ≥ F − F_optimal when it is.
+    """The answer: `optimal`, with every eigenvalue of Q − Λ ≥ −shift and `gap_bound` ≥ F − F_optimal when it is.
 
-    When it is not, `smallest_eigenvalue` is that of Q − Λ, and `direction (n, d)` its eigenvector: where F falls once
-    the rotations may leave their space.
+    When it is not, `smallest_eigenvalue` is that of Q − Λ, NaN where it was not found, and `direction (n, d)` its
+    eigenvector: where F falls once the rotations may turn into another dimension.
     """
 
     optimal: bool

@@ -41,7 +41,7 @@ class Ordering:
 class Group:
     """Vertices of one round with k neighbours each, which later rounds or the core hold.
 
-    - `begin`, `end`: their positions; `neighbours (m, k)` the positions of theirs, ascending.
+    - `begin`, `end`: their positions in the order; `neighbours (m, k)` the positions of theirs, ascending.
     - `slots`: of their blocks above the diagonal, vertex by vertex.
     - `scatter`: sums what their elimination adds, pair a ≤ b by pair of neighbours, into `targets`, which count the
       diagonal blocks first and then the others.
