@@ -14,11 +14,20 @@ need libX11.so.6 libx11-6
 need libgomp.so.1 libgomp1
 [ -n "$missing" ] || exit 0
 
+get() { # apt-get, after another one (a fresh machine's unattended upgrades) is done: at most ten minutes
+    for _ in $(seq 120); do
+        said=$(DEBIAN_FRONTEND=noninteractive apt-get "$@" 2>&1) && return 0
+        case $said in *"Could not get lock"*) sleep 5 ;; *) break ;; esac
+    done
+    echo "$said" >&2
+    return 1
+}
+
 if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
     echo "installing:$missing"
-    apt-get update -qq
+    get update -qq
     # shellcheck disable=SC2086 # a list of packages
-    DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $missing
+    get install -y -qq --no-install-recommends $missing
 else
     echo "open3d needs system libraries that are missing. On Debian or Ubuntu: sudo apt-get install$missing" >&2
     exit 1
