@@ -214,7 +214,7 @@ def test_the_terminal_gets_ten_lines_of_80_columns(report: Report) -> None:
         assert "time     3.0 s, 4.0 CPU s in the stages, at most 300 MB" in lines
         assert lines[-2:] == ["report   runs/a/report.html", "next     hodge view runs/a --web"]
     assert "  - … and 4 more measures: --verbose" in lines
-    assert any(line.startswith("look     The viewing graph falls into 3 parts") for line in lines), "doubt comes first"
+    assert "look     The viewing graph falls into 3 parts that nothing connects …" in lines, "cut at a clause"
     assert any(line.endswith(" …") for line in lines), "a long note is cut"
 
 
