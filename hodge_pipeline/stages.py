@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 
 from hodge_pipeline.scene import Scene
 from hodge_pipeline.types import (
@@ -304,8 +304,8 @@ class TrackedModel(Protocol):
     def merged(self) -> TrackedModel:
         """Points that a match calls one merged where one position fits; this very model where there are none."""
 
-    def adjusted(self, priors: PositionPriors | None = None) -> TrackedModel:
-        """Bundle adjustment of poses and points. Raises `SourceError` where it fails."""
+    def adjusted(self, priors: PositionPriors | None = None, *, move_bodies: bool = True) -> TrackedModel:
+        """Bundle adjustment of poses and points, or of points alone. Raises `SourceError` where it fails."""
 
     def with_robust_loss(self) -> TrackedModel:
         """The same model, whose adjustments let an observation that is far off pull little."""
@@ -322,9 +322,9 @@ class TrackedModel(Protocol):
     def standard_errors(self) -> Floats:
         """Standard errors (B, 2) of each body's rotation and position, radians and units."""
 
-    def held_out_errors(self, entries: Bools, *, move_bodies: bool) -> Floats:
-        """Errors (H,) in pixels of the observations chosen from the N of `quality`, after an adjustment of the points,
-        and of the bodies where those move, without them; those that their points cannot spare are left out.
+    def held_out_errors(self, entries: Bools, adjusts: Literal["nothing", "points", "all"]) -> Floats:
+        """Errors (H,) in pixels of the observations chosen from the N of `quality`, after an adjustment without them of
+        nothing, of the points, or of bodies too; those that their points cannot spare are left out.
         """
 
     def write(self, folder: Path) -> None:

@@ -17,8 +17,10 @@ from hodge_pipeline.stages import Step, Steps, TrackedModel, Workers
 from hodge_pipeline.types import Bools, Floats, PositionPriors, ViewGraph
 
 MODEL = "model"
-GIVEN, ADJUSTED, RESECTED = "as given", "bundle adjustment", "resection and bundle adjustment"
-ROBUST = "resection and robust bundle adjustment"
+GIVEN, POINTS, ADJUSTED = "as given", "bundle adjustment of points alone", "bundle adjustment"
+REPLACED = "points placed anew and bundle adjustment"
+RESECTED = "resection and bundle adjustment"
+ROBUST, ROBUST_POINTS = "resection and robust bundle adjustment", "robust bundle adjustment of points alone"
 AFTER_ROBUST = "bundle adjustment without a robust loss from there"
 CONSISTENT, MENDED = "consistent poses and bundle adjustment", "images that are off placed anew and bundle adjustment"
 MENDINGS = 3
@@ -29,10 +31,11 @@ NO_EDGE_LEFT = "every edge was rejected: no two of them agree"
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model that might be kept, under the name by which a report calls it."""
+    """A model that might be kept, under the name by which a report calls it; `holds_poses`: those of the input."""
 
     name: str
     model: TrackedModel
+    holds_poses: bool = False
 
 
 @dataclass(frozen=True)
@@ -64,13 +67,18 @@ class Found:
         """The row of the candidate with the lowest cost."""
         return best(self.costs)
 
+    @property
+    def held(self) -> int:
+        """The row of the candidate with the input's poses that has the lowest cost."""
+        return min((row for row, one in enumerate(self.candidates) if one.holds_poses), key=lambda row: self.costs[row].px)
+
 
 class _Weighing:
     """The candidates so far; each new one is a step, and one whose adjustment fails is a note."""
 
     def __init__(self, inputs: Sequence[TrackedModel], start: TrackedModel, steps: Steps) -> None:
         self._inputs, self._steps = [model.quality for model in inputs], steps
-        self.candidates, self.notes = [Candidate(GIVEN, start)], list[str]()
+        self.candidates, self.notes = [Candidate(GIVEN, start, holds_poses=True)], list[str]()
         self._known = start.known_positions
         self.update()
 
@@ -89,16 +97,22 @@ class _Weighing:
         return lowest.is_sound or (len(same) > 1 and not lowest.images_off)
 
     def add(
-        self, name: str, model: TrackedModel, poses: Floats | None = None, priors: PositionPriors | None = None
+        self,
+        name: str,
+        model: TrackedModel,
+        poses: Floats | None = None,
+        priors: PositionPriors | None = None,
+        *,
+        move_bodies: bool = True,
     ) -> None:
         try:
-            found = self._steps.step(adjusted_model, model, poses, priors or self._known, title=name)
+            found = self._steps.step(adjusted_model, model, poses, priors or self._known, move_bodies, title=name)
         except SourceError as error:
             self.notes.append(f"{name}: {error}")
             return
         adjusted = model.read_back(found.folder, found.notes)
         self._steps.remember(adjusted, self._steps.key(found))
-        self.candidates.append(Candidate(name, adjusted))
+        self.candidates.append(Candidate(name, adjusted, holds_poses=not move_bodies))
         self.update()
 
 
@@ -115,14 +129,17 @@ def weigh(
     Depth takes part where the model is in metres: else its clouds are in another unit, or not of these images.
     """
     weighing, plain, plainly = _Weighing(inputs, start, steps), start, 0
+    weighing.add(POINTS, start, start.world_from_body, move_bodies=False)
     weighing.add(ADJUSTED, start)
     if not weighing.costs[0].is_sound:
+        weighing.add(REPLACED, start, start.world_from_body)
         poses = steps.step(resected_poses, start, None, title="resection").poses
         weighing.add(RESECTED, start, poses)
         if not weighing.costs[weighing.best].is_sound:
             plainly = len(weighing.candidates)
             key, start = steps.key([start, ROBUST]), start.with_robust_loss()
             steps.remember(start, key)
+            weighing.add(ROBUST_POINTS, start, start.world_from_body, move_bodies=False)
             weighing.add(ROBUST, start, poses)
     depth = depth_edges(start, options, steps, workers) if is_metric else no_depth_edges(start)
     solved = None
@@ -203,17 +220,26 @@ class AdjustedModel:
 
 
 def adjusted_model(
-    start: TrackedModel, poses: Floats | None, priors: PositionPriors | None, *, step: Step
+    start: TrackedModel, poses: Floats | None, priors: PositionPriors | None, move_bodies: bool = True, *, step: Step
 ) -> AdjustedModel:
     """Step: the bundle adjustment from the model's own poses or from these, with points that a match calls one merged.
 
-    What it brings together can be merged after it, and is then adjusted once more.
+    What it brings together can be merged after it, and is then adjusted once more. Where bodies are not to move, points
+    alone are adjusted, and none is merged.
     """
+    if poses is not None and not move_bodies:
+        return _written(start.moved(poses).adjusted(priors, move_bodies=False), step)
     model = start if poses is None else start.moved(poses).merged()
     adjusted = model.adjusted(priors)
     if poses is not None:
         merged = adjusted.merged()
         adjusted = adjusted if merged is adjusted else merged.moved(merged.world_from_body).adjusted(priors)
+    return _written(adjusted, step)
+
+
+def _written(adjusted: TrackedModel, step: Step) -> AdjustedModel:
+    if not np.isfinite(adjusted.world_from_body).all():
+        raise SourceError("bundle adjustment leaves poses that are no numbers")
     folder = step.folder / MODEL
     folder.mkdir(exist_ok=True)
     adjusted.write(folder)

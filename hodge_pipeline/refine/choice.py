@@ -12,7 +12,7 @@ from hodge_pipeline.evaluation.scores import SIGMA_M
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.refine.candidates import Found
 from hodge_pipeline.refine.guard import Measure
-from hodge_pipeline.refine.judge import best
+from hodge_pipeline.refine.judge import best, mends
 from hodge_pipeline.stages import Step, Steps, TrackedModel
 from hodge_pipeline.types import Floats
 
@@ -52,9 +52,11 @@ def choose(found: Found, distances_m: Floats, seed: int, steps: Steps, *, force:
     """
     merging = _merging(found)
     at = _best(found, merging, distances_m)
-    reason = "no candidate costs less" if at == 0 else ""
+    reason = "" if at else "no candidate costs less"
     if at and not merging[at] and _by_depth(distances_m, 0, at) <= 0 and not _fits_positions(found, 0, at):
         reason = _reason_to_keep(found, at, seed, steps)
+    if reason and found.held and not (at == found.held or _reason_to_keep(found, found.held, seed, steps)):
+        at, reason = found.held, ""
     if not reason:
         return Choice(at, "")
     if not force or len(found.costs) == 1:
@@ -81,24 +83,32 @@ def refused_doubt(found: Found, choice: Choice, distances_m: Floats) -> str:
     cost.
     """
     at = _best(found, _merging(found), distances_m)
-    if choice.row or found.costs[0].px < FINEST_PX or not _gain(found, at) >= CLEAR_GAIN:
+    kept = found.costs[choice.row].px
+    if not found.candidates[choice.row].holds_poses or kept < FINEST_PX or not _gain(found, at) >= CLEAR_GAIN:
         return ""
-    error = " → ".join(alike(found.costs[0].px, found.costs[at].px, 3))
+    error = " → ".join(alike(kept, found.costs[at].px, 3))
     return f"in doubt, since {found.candidates[at].name} fits much better ({error} px)"
 
 
 def _gain(found: Found, at: int) -> float:
-    """The share of the input's cost that a candidate saves, each as it would be were nothing fitted."""
-    return 1.0 - _per_freedom(found, at) / _per_freedom(found, 0, poses=False)
+    """The share that a candidate saves of the cost that its reference has, each as it would be were nothing fitted."""
+    return 1.0 - _per_freedom(found, at) / _per_freedom(found, _reference(found, at))
 
 
-def _per_freedom(found: Found, row: int, *, poses: bool = True) -> float:
+def _reference(found: Found, at: int) -> int:
+    """What a candidate must be better than: the input, or, where it moves poses, the best with the input's poses."""
+    return 0 if found.candidates[at].holds_poses else found.held
+
+
+def _per_freedom(found: Found, row: int) -> float:
     """The cost as it would be were nothing fitted: fewer points have less to fit noise with. Infinite where nothing
-    is left over. Without `poses` as of poses that were measured by other means.
+    is left over. Poses of the input count as measured by other means.
     """
     model, cost = found.candidates[row].model, found.costs[row]
     numbers = 2.0 * len(model.quality.errors_px)
-    left = numbers - 3.0 * model.quality.points - 6.0 * len(model.body_names) * poses
+    left = numbers - 3.0 * model.quality.points
+    if not found.candidates[row].holds_poses:
+        left -= 6.0 * len(model.body_names)
     return cost.px * float(np.sqrt(numbers / left)) if left > 0 else float("inf")
 
 
@@ -126,26 +136,28 @@ def _merging(found: Found) -> Sequence[bool]:
 
 
 def _reason_to_keep(found: Found, at: int, seed: int, steps: Steps) -> str:
-    """Why the input is kept all the same, empty where the candidate is clearly better."""
-    before, after = found.costs[0], found.costs[at]
-    start, model = found.candidates[0].model, found.candidates[at].model
+    """Why the input, or its poses, are kept all the same; empty where the candidate is clearly better."""
+    reference = _reference(found, at)
+    before, after = found.costs[reference], found.costs[at]
+    start, model = found.candidates[reference].model, found.candidates[at].model
+    mending = mends(before, after)
     if before.px < FINEST_PX:
         return f"observations fit to {before.px:.2g} px, better than any keypoint is located"
     if after.doubt:
         return "no candidate fits the tracks: mend matches or cameras (--refine focal), or --force the best one"
     gain = _gain(found, at)
-    if not gain >= LEAST_GAIN:
+    if not (mending or gain >= LEAST_GAIN):
         fitted = f"{' → '.join(alike(before.px, after.px, 4))} px"
         return f"the best candidate's gain ({fitted}) is what so many poses gain by fitting noise"
-    if gain >= CLEAR_GAIN and start.quality.mean_track_length >= LONG_TRACKS:
+    if mending or (gain >= CLEAR_GAIN and start.quality.mean_track_length >= LONG_TRACKS):
         return ""
     moved = absolute_error(model.world_from_body, start.world_from_body, with_scale=True).rmse_m
     extent = float(np.linalg.norm(np.ptp(start.world_from_body[:, :3, 3], axis=0)))
     share = moved / extent if extent > 0 else 0.0
-    mends = set(after.images_off) < set(before.images_off)
-    if share > LEAST_MOVE and gain < GAIN_TO_MOVE and not mends and not start.moves_intrinsics:
+    if share > LEAST_MOVE and gain < GAIN_TO_MOVE and not start.moves_intrinsics:
         return f"the best candidate gains {gain:.1%} of the mean error and moves cameras by {share:.2%} of their extent"
-    errors = steps.step(held_out_errors, start, model, seed, title="observations held out").errors_px
+    moves = not found.candidates[at].holds_poses
+    errors = steps.step(held_out_errors, start, model, seed, moves, title="observations held out").errors_px
     if not errors.size and gain < CLEAR_GAIN and model.quality.points == start.quality.points:
         return (
             f"the best candidate gains {gain:.1%} of the mean error, and tracks are too short to hold any of them out"
@@ -165,12 +177,17 @@ class HeldOutErrors:
     errors_px: Floats
 
 
-def held_out_errors(start: TrackedModel, model: TrackedModel, seed: int, *, step: Step) -> HeldOutErrors:
-    """Step: errors at observations that points were not adjusted to, nor the poses of the model; the start's stay."""
+def held_out_errors(
+    start: TrackedModel, model: TrackedModel, seed: int, moves: bool = True, *, step: Step
+) -> HeldOutErrors:
+    """Step: errors at observations that neither points were adjusted to nor, where it `moves` them, the model's poses.
+
+    The start keeps its poses; its points too, where the model does not move them either.
+    """
     out = []
-    for one, moves in ((start, False), (model, True)):
+    for one, adjusts in ((start, "points" if moves else "nothing"), (model, "all" if moves else "points")):
         chosen = np.random.default_rng(seed).random(len(one.quality.errors_px)) < HELD_OUT_SHARE
-        out.append(one.held_out_errors(chosen, move_bodies=moves))
+        out.append(one.held_out_errors(chosen, adjusts))
     if len(out[0]) != len(out[1]):  # tracks were merged: they are not the same observations
         return HeldOutErrors(np.zeros((2, 0)))
     return HeldOutErrors(np.array(out))

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.stats import binom
 
 from hodge_pipeline.types import Bools, Floats, Ints, ModelQuality
 from hodge_pipeline.types.text import counted
@@ -26,6 +27,8 @@ OFF_SHARE, DOUBTFUL_SHARE = 0.5, 0.1
 """Of the observations of an image, or of all of them."""
 NAMED_IMAGES = 3
 """In a verdict; the report has them all."""
+BY_CHANCE = 1e-4
+"""Probability that a candidate mends so many more observations than it spoils where each is as likely."""
 SOUND_SHARE = 0.05
 """Of the observations beyond the cap: as many are wrong in models that nothing is the matter with."""
 
@@ -37,7 +40,7 @@ class Cost:
     `px`: the mean error, each capped at `cap_px`, where an observation that is lost, behind its camera or without the
     parallax it should have counts as the cap; `median_px` likewise. Of `observations`, so many are `behind`, `distant`
     (without parallax), and the share `beyond` lies beyond the cap; `images_off`: where most do; `images_in_doubt`:
-    where a tenth does.
+    where a tenth does. `near (observations,)`: which are within the cap.
     """
 
     px: float
@@ -49,6 +52,7 @@ class Cost:
     beyond: float
     images_off: tuple[str, ...]
     images_in_doubt: tuple[str, ...]
+    near: Bools = field(compare=False, repr=False)
 
     @property
     def doubt(self) -> str:
@@ -102,7 +106,7 @@ _PARTS = ("errors_px", "parallaxes_deg", "track_lengths")
 def _costs(errors_px: Floats, distant: Bools, weights: Floats, image: Ints, names: Sequence[str]) -> list[Cost]:
     if not len(weights):
         nan = float("nan")
-        return [Cost(nan, nan, nan, 0, 0, 0, 1.0, (), ()) for _ in errors_px]
+        return [Cost(nan, nan, nan, 0, 0, 0, 1.0, (), (), np.zeros(0, bool)) for _ in errors_px]
     behind = np.isinf(errors_px)
     effective = np.where(distant | behind, np.inf, errors_px)
     medians = np.median(effective, axis=1)
@@ -124,9 +128,20 @@ def _costs(errors_px: Floats, distant: Bools, weights: Floats, image: Ints, name
                 beyond=float(weights @ beyond / weights.sum()),
                 images_off=tuple(name for name, one in zip(names, share.tolist(), strict=True) if one > OFF_SHARE),
                 images_in_doubt=tuple(n for n, one in zip(names, share.tolist(), strict=True) if one > DOUBTFUL_SHARE),
+                near=~beyond,
             )
         )
     return out
+
+
+def mends(before: Cost, after: Cost) -> bool:
+    """Whether a candidate explains observations that were off, so many more than it spoils that chance does not, and
+    spoils no image; both of the same `costs`.
+    """
+    mended, spoilt = int((after.near & ~before.near).sum()), int((before.near & ~after.near).sum())
+    if set(after.images_off) - set(before.images_off):
+        return False
+    return bool(mended > spoilt and binom.sf(mended - 1, mended + spoilt, 0.5) < BY_CHANCE)
 
 
 def named(images: Sequence[str]) -> str:

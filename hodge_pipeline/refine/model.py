@@ -137,7 +137,7 @@ def _refine(
         or cost.images_doubt
         or refused_doubt(found, choice, distances_m)
     )
-    doubt = doubt or (_loose_doubt(start, model) if at and not is_metric else "")
+    doubt = doubt or (_loose_doubt(start, model) if not found.candidates[at].holds_poses and not is_metric else "")
     decision = _placed_decision(start, found, choice) or _decision(found, choice, scales, force, bool(doubt))
     measures = _measures(found, at, start, model, distances_m)
     names = [(one.name, cost) for one, cost in zip(found.candidates, found.costs, strict=True)]
@@ -198,7 +198,8 @@ def _in_the_scale_of(start: TrackedModel, model: TrackedModel) -> TrackedModel:
     baselines = np.abs(start.body_from_cam[:, :3, 3]).max()
     if baselines > NO_BASELINE * np.ptp(start.world_from_body[:, :3, 3], axis=0).max():
         return model
-    return model.scaled(align(model.world_from_body, start.world_from_body, with_scale=True).scale)
+    scale = align(model.world_from_body, start.world_from_body, with_scale=True).scale
+    return model.scaled(scale) if scale > 0 else model  # 0: all of the start's positions are one
 
 
 def _metric_poses(found: Found) -> Floats:

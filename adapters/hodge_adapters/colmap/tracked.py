@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -251,21 +252,24 @@ class ColmapModel:
         notes = (*self.notes, f"{counted(count, 'pair')} of points that a match calls one were merged")
         return replace(self, reconstruction=copy, files=(), notes=notes, tracks=None)
 
-    def adjusted(self, priors: PositionPriors | None = None) -> ColmapModel:
+    def adjusted(self, priors: PositionPriors | None = None, *, move_bodies: bool = True) -> ColmapModel:
         """Bundle adjustment with rigs held, and intrinsics unless they are to be refined; see `colmap_bundle`.
 
         Where it leaves a few points behind their cameras, those are placed anew and all is adjusted once more.
         """
-        first = self._adjusted(priors)
+        first = self._adjusted(priors, move_bodies)
         behind = len(first._behind())
         if not 0 < behind <= FEW_BEHIND * len(first.quality.errors_px):
             return first
         placed = first.moved(first.world_from_body)
-        return placed._adjusted(priors) if len(placed._behind()) < behind else first
+        return placed._adjusted(priors, move_bodies) if len(placed._behind()) < behind else first
 
-    def _adjusted(self, priors: PositionPriors | None) -> ColmapModel:
+    def _adjusted(self, priors: PositionPriors | None, move_bodies: bool) -> ColmapModel:
         copy = self._copy()
-        loose = adjust(copy, self._behind(), self.bodies, priors, refine=self.refine, robust=self.robust)
+        refine: Intrinsics = self.refine if move_bodies else "none"
+        loose = adjust(
+            copy, self._behind(), self.bodies, priors, move_bodies=move_bodies, refine=refine, robust=self.robust
+        )
         if loose:
             after = refreshed(self.records, copy)
             poses = np.array([image.world_from_cam for image in after.images])
@@ -297,8 +301,8 @@ class ColmapModel:
         """Of each body's rotation and position (B, 2), radians and units; see `colmap_uncertainty`."""
         return standard_errors(self.records, self.bodies)
 
-    def held_out_errors(self, entries: Bools, *, move_bodies: bool) -> Floats:
-        """Errors (H,) of these entries of tracks (T,) after an adjustment without them, of the points or of all.
+    def held_out_errors(self, entries: Bools, adjusts: Literal["nothing", "points", "all"]) -> Floats:
+        """Errors (H,) of these entries of tracks (T,) after an adjustment without them of nothing, the points or all.
 
         An entry whose point too few others would place is left in, and out of the answer.
         """
@@ -311,7 +315,8 @@ class ColmapModel:
                 held.append(at)
                 image = records.images[records.image_rows[at]]
                 copy.delete_observation(image.image_id, int(records.points.columns[at]))
-        adjust(copy, [], self.bodies, None, move_bodies=move_bodies, robust=self.robust)
+        if adjusts != "nothing":
+            adjust(copy, [], self.bodies, None, move_bodies=adjusts == "all", robust=self.robust)
         return reprojection_errors(refreshed(records, copy))[1][held]
 
     def write(self, folder: Path) -> None:
