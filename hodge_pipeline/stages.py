@@ -311,8 +311,8 @@ class TrackedModel(Protocol):
         """The same model, whose adjustments let an observation that is far off pull little."""
         ...
 
-    def with_free_focal_lengths(self) -> TrackedModel:
-        """The same model, whose adjustments refine focal lengths."""
+    def with_free_intrinsics(self, refine: Literal["focal", "all"]) -> TrackedModel:
+        """The same model, whose adjustments refine focal lengths, or all intrinsics."""
         ...
 
     @property

@@ -67,10 +67,14 @@ class Found:
         """The row of the candidate with the lowest cost."""
         return best(self.costs)
 
+    def px(self, row: int) -> float:
+        """The cost of a candidate, pixels."""
+        return self.costs[row].px
+
     @property
     def held(self) -> int:
         """The row of the candidate with the input's poses that has the lowest cost."""
-        return min((row for row, one in enumerate(self.candidates) if one.holds_poses), key=lambda row: self.costs[row].px)
+        return min((row for row, one in enumerate(self.candidates) if one.holds_poses), key=self.px)
 
 
 class _Weighing:

@@ -82,9 +82,10 @@ def refused_doubt(found: Found, choice: Choice, distances_m: Floats) -> str:
     """A doubt where the input is kept though a candidate, which depth does not refuse, leaves less than half of its
     cost.
     """
-    at = _best(found, _merging(found), distances_m)
-    kept = found.costs[choice.row].px
-    if not found.candidates[choice.row].holds_poses or kept < FINEST_PX or not _gain(found, at) >= CLEAR_GAIN:
+    at, kept = _best(found, _merging(found), distances_m), found.px(choice.row)
+    if at == choice.row or not found.candidates[choice.row].holds_poses or kept < FINEST_PX:
+        return ""
+    if not _gain(found, at) >= CLEAR_GAIN:
         return ""
     error = " → ".join(alike(kept, found.costs[at].px, 3))
     return f"in doubt, since {found.candidates[at].name} fits much better ({error} px)"

@@ -13,7 +13,7 @@ from hodge_pipeline.evaluation.trajectory import align
 from hodge_pipeline.executors.dask import open_workers
 from hodge_pipeline.refine.candidates import GIVEN, Found, weigh
 from hodge_pipeline.refine.choice import Choice, choose, held_out_score, refused_doubt
-from hodge_pipeline.refine.focal import focal_doubt
+from hodge_pipeline.refine.focal import intrinsics_doubt
 from hodge_pipeline.refine.guard import Change, Decision, Measure
 from hodge_pipeline.refine.judge import SAME_COST, Cost, named
 from hodge_pipeline.refine.model_edges import held_out_distances
@@ -132,7 +132,7 @@ def _refine(
     change = _change(start, scales[0], model, in_world) if len(inputs) == 1 and at else None
     cost = found.costs[at]
     doubt = (
-        focal_doubt(found.candidates[found.best].model, steps)
+        intrinsics_doubt(found, steps)
         or cost.doubt
         or cost.images_doubt
         or refused_doubt(found, choice, distances_m)

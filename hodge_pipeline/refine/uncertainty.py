@@ -64,10 +64,13 @@ def told_apart(start: TrackedModel, model: TrackedModel) -> bool:
 
 
 def loose(start: TrackedModel, model: TrackedModel) -> Bools:
-    """Which bodies (B,) tracks fix far less well than the others, and than the poses moved: they may be worse now."""
+    """Which bodies (B,) moved though tracks fix them far less well than the others, and than the poses moved: they may
+    be worse now.
+    """
     moved, known = _moved_and_known(start, model)
-    least = np.maximum(np.sqrt((moved**2).mean(axis=0)), SIGMAS * np.median(known, axis=0))
-    return np.asarray((known > least).any(axis=1))
+    usual = np.median(known, axis=0)
+    least = np.maximum(np.sqrt((moved**2).mean(axis=0)), SIGMAS * usual)
+    return np.asarray(((known > least) & (moved > usual)).any(axis=1))
 
 
 def _moved_and_known(start: TrackedModel, model: TrackedModel) -> tuple[Floats, Floats]:

@@ -283,9 +283,9 @@ class ColmapModel:
         """The same model, whose adjustments let an observation that is far off pull little."""
         return replace(self, robust=True)
 
-    def with_free_focal_lengths(self) -> ColmapModel:
-        """The same model, whose adjustments refine focal lengths."""
-        return replace(self, refine="focal")
+    def with_free_intrinsics(self, refine: Literal["focal", "all"]) -> ColmapModel:
+        """The same model, whose adjustments refine focal lengths, or principal points and distortion too."""
+        return replace(self, refine=refine)
 
     @property
     def moves_intrinsics(self) -> bool:
@@ -329,16 +329,23 @@ class ColmapModel:
         return replace(self, reconstruction=back, files=(), notes=(*notes, *self._refined_cameras(back)), tracks=None)
 
     def _refined_cameras(self, after: pycolmap.Reconstruction) -> tuple[str, ...]:
-        """A line on how the adjustment to another model changed focal lengths."""
+        """Lines on how the adjustment to another model changed focal lengths and principal points."""
         if not self.moves_intrinsics:
             return ()
         cameras = self.reconstruction.cameras
         pairs = [(cameras[key].mean_focal_length(), new.mean_focal_length()) for key, new in after.cameras.items()]
         ratios: Floats = np.array([new / old for old, new in pairs])
-        if len(ratios) == 1:
-            return (f"focal length {pairs[0][0]:.6g} → {pairs[0][1]:.6g} px",)
         low, middle, high = 100 * (np.percentile(ratios, [0, 50, 100]) - 1)
-        return (f"focal lengths of {len(ratios)} cameras changed by {middle:+.3g} % ({low:+.3g} to {high:+.3g} %)",)
+        told = [f"focal lengths of {len(ratios)} cameras changed by {middle:+.3g} % ({low:+.3g} to {high:+.3g} %)"]
+        if len(ratios) == 1:
+            told = [f"focal length {pairs[0][0]:.6g} → {pairs[0][1]:.6g} px"]
+        if self.refine == "all":
+            shift = [
+                np.hypot(new.principal_point_x - old.principal_point_x, new.principal_point_y - old.principal_point_y)
+                for old, new in ((cameras[key], new) for key, new in after.cameras.items())
+            ]
+            told += [f"principal points moved by {np.median(shift):.3g} px"]
+        return tuple(told)
 
     def _copy(self) -> pycolmap.Reconstruction:
         return pycolmap.Reconstruction(self.reconstruction)
