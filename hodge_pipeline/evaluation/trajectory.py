@@ -13,6 +13,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types.arrays import rms
 
 COLLINEAR = 1e-6
 """Second singular value over the first of the positions' covariance, below which they determine no roll."""
@@ -93,7 +94,7 @@ def absolute_error(
     known = per_frame_m[usable]
     median, largest = (np.median(known), known.max()) if len(known) else (np.nan,) * 2
     return AbsoluteError(
-        rmse_m=_rms(known),
+        rmse_m=rms(known),
         median_m=float(median),
         max_m=float(largest),
         frames=int(usable.sum()),
@@ -131,10 +132,6 @@ def _usable(estimate: Floats, reference: Floats) -> Bools:
     return np.asarray(se3.has_pose(estimate) & se3.has_pose(reference))
 
 
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
-
-
 @dataclass(frozen=True)
 class RelativeError:
     """Relative pose error over `delta_frames`, of the pairs of frames that can be compared; NaN of none."""
@@ -161,4 +158,4 @@ def relative_error(
     true_motion = se3.inverse(reference[chosen]) @ reference[chosen + delta_frames]
     error = se3.inverse(true_motion) @ motion
     translation_m = np.linalg.norm(error[:, :3, 3], axis=-1)
-    return RelativeError(delta_frames, _rms(translation_m), _rms(np.rad2deg(se3.rotation_angle(error))))
+    return RelativeError(delta_frames, rms(translation_m), rms(np.rad2deg(se3.rotation_angle(error))))
