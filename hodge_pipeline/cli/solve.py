@@ -23,11 +23,11 @@ from hodge_pipeline.types import Source
 from hodge_pipeline.types.text import command, counted
 
 COUNTED = ("pose", "edge", "piece")
+"""Counts of the summary that are printed."""
 KNOWN_ENDINGS = (".tum", ".kitti", ".csv", ".log", ".json", ".ply")
-"""Endings that say the format. `.txt` does not: many programs name their g2o files so."""
-
+"""Endings that tell the format. `.txt` does not: many programs name their g2o files so."""
 NOTES = 2
-"""In ten lines."""
+"""Printed without `--verbose`."""
 
 
 def choices(
@@ -41,7 +41,10 @@ def choices(
     certificate: bool,
     sesync_units: bool,
 ) -> SolveOptions:
-    """The options as given, checked. Only the isotropic objective has a certificate, so asking for one implies it."""
+    """The checked options; a certificate implies the isotropic objective, which alone has one.
+
+    Raises `RecipeError` for options that are wrong or contradict each other.
+    """
     named = objective or ("isotropic" if certificate or sesync_units else "full")
     for option, value, known in (
         ("--objective", named, get_args(ObjectiveName)),
@@ -102,7 +105,7 @@ def solve(
 
 
 def _writer(out: Path, source: Source) -> str:
-    """The writer of a result by its ending: those of poses, and Open3D's; any other name is that of a g2o file."""
+    """The writer of a result by its ending; any ending that tells no format is a g2o file's."""
     return writer_name(out, source) if out.suffix.lower() in KNOWN_ENDINGS else "g2o"
 
 
