@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.judging import has_unit_information, in_vertex_order
+from hodge_pipeline.complex.chi2 import has_unit_information, in_vertex_order
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.solvers.backbone.chain import consecutive_edges
 from hodge_pipeline.solvers.backbone.parallel import FEWEST, fused

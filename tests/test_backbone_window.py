@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.judging import has_unit_information
+from hodge_pipeline.complex.chi2 import has_unit_information
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import solve_robust

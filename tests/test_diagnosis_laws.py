@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from benchmarks.edge_scores import area_under_roc
 from diagnosis_graphs import SIGMA, every_pair_tried, measured, near_pairs, poses_on_a_ring, spoiled
 from hodge_pipeline import se3
-from hodge_pipeline.complex.judging import chi2_by_information, mean_variances, residual_twists, squares_at_both_ends
+from hodge_pipeline.complex.chi2 import chi2_by_information, mean_variances, residual_twists, squares_at_both_ends
 from hodge_pipeline.complex.short_cycles import short_cycles
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions

@@ -111,7 +111,7 @@ def test_iou_in_many_blocks_is_that_of_one(monkeypatch: pytest.MonkeyPatch) -> N
     rng = np.random.default_rng(3)
     clouds = [PointCloud(rng.uniform(0, 1, (30, 3)).astype(np.float32)) for _ in range(9)]
     whole = pairwise_iou(clouds, poses_at(*[0.0] * 9), 0.2)
-    monkeypatch.setattr("hodge_pipeline.pairs.overlap.BLOCK_ENTRIES", 18)
+    monkeypatch.setattr("hodge_pipeline.pairs.candidates.BLOCK_ENTRIES", 18)
     assert whole.nnz == 36
     assert (pairwise_iou(clouds, poses_at(*[0.0] * 9), 0.2) != whole).nnz == 0
 

@@ -13,7 +13,7 @@ import pytest
 from hodge_adapters.seven_scenes.reader import SevenScenesReader
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.pairs.sift import SiftEdges, count_inliers
-from hodge_pipeline.pairs.sift_similarity import most_similar
+from hodge_pipeline.pairs.vlad import most_similar
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
 from hodge_pipeline.registration.descriptors import match
 from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats, Frame, PointCloud

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.solvers import chordal
-from hodge_pipeline.solvers.chordal import RotationGraph, multilevel_rotations
+from hodge_pipeline.solvers import chordal, multilevel
 from hodge_pipeline.solvers.elimination import independent_set
 from hodge_pipeline.solvers.maximum_likelihood import solve
+from hodge_pipeline.solvers.multilevel import RotationGraph, multilevel_rotations
 from hodge_pipeline.solvers.setup import prepare
 from hodge_pipeline.types import ViewGraph
 
@@ -49,7 +49,7 @@ def noisy_lattice(side, sigma):
 
 @pytest.mark.parametrize(("sigma", "same"), [(0.05, False), (0.3, True)])
 def test_noise_brings_the_chordal_start_back(sigma, same, monkeypatch):
-    monkeypatch.setattr(chordal, "COARSEST", 50)
+    monkeypatch.setattr(multilevel, "COARSEST", 50)
     monkeypatch.setattr(chordal, "MULTILEVEL_SECONDS_AN_EDGE", 0.0)
     problem = prepare(noisy_lattice(6, sigma)).problem
     pinned = np.eye(3)[None]
@@ -61,7 +61,7 @@ def test_noise_brings_the_chordal_start_back(sigma, same, monkeypatch):
 def test_the_minimum_is_that_of_the_chordal_start(monkeypatch):
     graph = noisy_lattice(8, 0.1)
     chordal_start = solve(graph, objective="isotropic")
-    monkeypatch.setattr(chordal, "COARSEST", 50)
+    monkeypatch.setattr(multilevel, "COARSEST", 50)
     monkeypatch.setattr(chordal, "AFFORDABLE_S", 0.0)
     monkeypatch.setattr(chordal, "MULTILEVEL_SECONDS_AN_EDGE", 0.0)
     other = solve(graph, objective="isotropic")

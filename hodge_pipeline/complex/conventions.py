@@ -9,8 +9,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.chi2 import residual_twists
 from hodge_pipeline.complex.cycles import edge_between, root_from_vertex, spanning_forest
-from hodge_pipeline.complex.judging import residual_twists
 from hodge_pipeline.types import Ints, ViewGraph
 
 NEARER = 4.0

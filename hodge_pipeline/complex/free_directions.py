@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.judging import has_unit_information
+from hodge_pipeline.complex.chi2 import has_unit_information
 from hodge_pipeline.types import Floats, ViewGraph
 from hodge_pipeline.types.text import counted
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hodge_pipeline.complex.chi2 import MEDIAN_CHI2
 from hodge_pipeline.complex.closing import cycle_errors
 from hodge_pipeline.complex.cycles import Loops
-from hodge_pipeline.complex.judging import MEDIAN_CHI2
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.types import Bools, Floats, Ints
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import check_graph
+from hodge_pipeline.complex.chi2 import in_vertex_order
 from hodge_pipeline.complex.closing import cycle_errors
 from hodge_pipeline.complex.free_directions import free_direction_notes
-from hodge_pipeline.complex.judging import in_vertex_order
 from hodge_pipeline.complex.short_cycles import with_cycles_of
 from hodge_pipeline.diagnosis.consensus import agreeing, find_consensus, sought_from
 from hodge_pipeline.diagnosis.cycles import Cycles, close_by_chance, judge_cycles, witnesses

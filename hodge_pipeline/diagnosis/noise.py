@@ -9,8 +9,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.chi2 import MEDIAN_CHI2, has_unit_information, mean_variances
 from hodge_pipeline.complex.cycles import Loops
-from hodge_pipeline.complex.judging import MEDIAN_CHI2, has_unit_information, mean_variances
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 DEFAULT_ANGLE_RAD, DEFAULT_SHARE = 0.03, 0.05

@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.judging import squares_at_both_ends
+from hodge_pipeline.complex.chi2 import squares_at_both_ends
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import PER_FOLD
 from hodge_pipeline.diagnosis.robust_poses import UNSETTLED, Solved

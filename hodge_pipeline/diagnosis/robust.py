@@ -13,9 +13,9 @@ from pydantic.dataclasses import dataclass as stage
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import check_graph
+from hodge_pipeline.complex.chi2 import has_unit_information
 from hodge_pipeline.complex.closing import closes_better_than_chance
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.judging import has_unit_information
 from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, backbone_or_diagnosis
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG, Diagnosis

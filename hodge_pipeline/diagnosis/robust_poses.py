@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hodge_pipeline.complex.chi2 import FREEDOM, STUDENT_99, residual_twists, squares_at_both_ends, tail_weight
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.judging import FREEDOM, STUDENT_99, residual_twists, squares_at_both_ends, tail_weight
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import Alignment
 from hodge_pipeline.solvers.minimise import descend_isotropic

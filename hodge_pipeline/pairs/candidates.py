@@ -1,8 +1,8 @@
-"""Common to edge builders: which frames can have an edge, and the union of several proposals."""
+"""Common to edge builders: which frames can have an edge, blocks of all pairs, and the union of several proposals."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +10,16 @@ from numpy.typing import NDArray
 
 from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints
+
+NO_PAIRS: Ints = np.zeros((0, 2), np.int64)
+BLOCK_ENTRIES = 4_000_000
+"""Bound on the entries of one block of a matrix of all pairs: about 50 MB where it is sparse, 16 MB of float32."""
+
+
+def row_blocks(count: int) -> Iterator[slice]:
+    """The rows of a (count, count) matrix in blocks of at most `BLOCK_ENTRIES` entries."""
+    step = max(1, BLOCK_ENTRIES // max(1, count))
+    return (slice(start, min(start + step, count)) for start in range(0, count, step))
 
 
 def usable_rows(clouds: CloudSet, world_from_cam: Floats | None = None) -> Ints:

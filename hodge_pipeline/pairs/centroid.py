@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
-from hodge_pipeline.pairs.candidates import usable_rows
+from hodge_pipeline.pairs.candidates import NO_PAIRS, usable_rows
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints
 
 
@@ -32,6 +32,6 @@ class CentroidEdges:
         """Pairs of centroids less than `max_distance_m` apart; none for frames without points or a finite pose."""
         rows = usable_rows(clouds, world_from_cam)
         if len(rows) < 2:
-            return Edges.proposed(np.zeros((0, 2), np.int64), "centroid")
+            return Edges.proposed(NO_PAIRS, "centroid")
         tree = cKDTree(centroids_in_world(clouds, world_from_cam, rows))
         return Edges.proposed(rows[tree.query_pairs(self.max_distance_m, output_type="ndarray")], "centroid")

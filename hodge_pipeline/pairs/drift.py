@@ -9,7 +9,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
-from hodge_pipeline.pairs.candidates import usable_rows
+from hodge_pipeline.pairs.candidates import NO_PAIRS, usable_rows
 from hodge_pipeline.pairs.overlap import pairwise_iou
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints
 
@@ -18,8 +18,9 @@ DRIFT_SHARE = 0.05
 %, of lidar by less.
 """
 OCTAVES = 8
+"""Sizes of voxels, each twice the last."""
 SAMPLED_FRAMES = 50
-NOTHING = np.zeros((0, 2), np.int64)
+"""Of a median range: a limit on cost."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -55,16 +56,16 @@ class DriftEdges:
         found = [
             self._of_one(usable[names[usable] == name], clouds, world_from_cam) for name in np.unique(names[usable])
         ]
-        pairs = np.concatenate([NOTHING, *(pairs for pairs, _ in found)])
+        pairs = np.concatenate([NO_PAIRS, *(pairs for pairs, _ in found)])
         return Edges.proposed(pairs, "drift", np.concatenate([np.zeros(0), *(overlap for _, overlap in found)]))
 
     def _of_one(self, rows: Ints, clouds: CloudSet, world_from_cam: Floats) -> tuple[Ints, Floats]:
         """The pairs of one sequence's rows, in their order, and their IoU."""
         if len(rows) < 2:
-            return NOTHING, np.zeros(0)
+            return NO_PAIRS, np.zeros(0)
         poses = world_from_cam[rows]
         way_m = path_length_m(poses, median_range_m(clouds, rows))
-        pairs, overlap = [NOTHING], [np.zeros(0)]
+        pairs, overlap = [NO_PAIRS], [np.zeros(0)]
         for octave in range(OCTAVES):
             voxel_m = self.voxel_m * 2**octave
             iou = pairwise_iou(clouds.read(rows), poses, voxel_m, above=self.min_iou).tocoo()

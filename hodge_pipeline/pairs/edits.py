@@ -25,6 +25,7 @@ EDGES = "edges.csv"
 FORMAT_VERSION = 1
 ENABLED, RIGHT, REGISTERED = "enabled", "right", "registered"
 VERBS = ("disable", "enable", "right", "register")
+"""The fields of an edit that hold pairs, in the order in which they are told."""
 Guess = tuple[str, tuple[float, ...]]
 """A pair to register, and the 16 numbers of the motion `i_from_j`, row by row, to register it from."""
 
@@ -132,6 +133,7 @@ def read_history_file(path: Path) -> History:
 
 
 def _edit(item: Any) -> Edit:
+    """One edit as JSON holds it. Raises `ValueError`, `TypeError` or `GraphError` where it is none."""
     if not isinstance(item, dict):
         raise ValueError("expected a mapping for each edit")
     undone = item.get("undone", False)
@@ -145,6 +147,7 @@ def _edit(item: Any) -> Edit:
 
 
 def _guess(item: Any) -> Guess:
+    """One guess as JSON holds it. Raises `ValueError`, `TypeError` or `GraphError` where it is no rigid motion."""
     pair, numbers = item
     if not isinstance(pair, str) or len(numbers) != 16 or not np.isfinite(np.asarray(numbers, float)).all():
         raise ValueError("expected a pair and 16 finite numbers for each guess")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -10,18 +10,11 @@ from pydantic.dataclasses import dataclass
 from scipy.sparse import csr_matrix
 
 from hodge_pipeline.complex.occupancy import voxel_occupancy
-from hodge_pipeline.pairs.candidates import usable_rows
+from hodge_pipeline.pairs.candidates import NO_PAIRS, row_blocks, usable_rows
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints, PointCloud
 
-BLOCK_ENTRIES = 4_000_000
-"""Bound on the entries of one block of the product: about 50 MB."""
 FRAMES_OF_A_PLACE, DIRECTIONS = 16, 4
-"""Nine edges a frame are kept in the end: 16 of each place leave a choice."""
-
-
-def _blocks(count: int) -> Iterator[slice]:
-    step = max(1, BLOCK_ENTRIES // max(1, count))
-    return (slice(start, min(start + step, count)) for start in range(0, count, step))
+"""Nine edges a frame are kept in the end: 16 of each place leave a choice. Cells to a unit of the view's direction."""
 
 
 def pairwise_iou(
@@ -35,8 +28,8 @@ def pairwise_iou(
 
     |A ∩ B| of all pairs is one sparse product of the frames-by-voxels occupancy with its transpose, made in blocks
     of rows, so that memory holds the answer and one block; |A ∪ B| = |A| + |B| − |A ∩ B|. The clouds are voxelised
-    in the world frame under the poses (N, 4, 4), on the lattice through the world's origin. Where `partners (R,)` are
-    named, only pairs with one of them.
+    in the world frame under the poses (N, 4, 4), on the lattice through the world's origin. Where `partners (R,)`,
+    ascending rows, are named, only pairs with one of them.
     """
     seen, sizes = voxel_occupancy(clouds, world_from_cam, voxel_m, partners)
     count = len(sizes)
@@ -44,7 +37,7 @@ def pairwise_iou(
     is_partner = np.isin(np.arange(count), partners)
     rows, columns, values = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
     others = seen[partners]
-    for block in _blocks(count):
+    for block in row_blocks(count):
         first = int(np.searchsorted(partners, block.start)) if len(partners) == count else 0
         common = (others[first:] @ seen[block].T).tocoo()  # the right side is copied
         i, j = common.col + block.start, partners[common.row.astype(np.int64) + first]
@@ -67,9 +60,9 @@ def some_of_each_place(world_from_cam: Floats, side_m: float) -> Ints:
     _, place = np.unique(np.floor(np.nan_to_num(cells)).astype(np.int64), axis=0, return_inverse=True)
     order = np.argsort(place.ravel(), kind="stable")
     sizes = np.bincount(place.ravel())
-    own = np.arange(len(order)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    rank = np.arange(len(order)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
     share = np.repeat(np.minimum(FRAMES_OF_A_PLACE / sizes, 1.0), sizes)
-    return np.sort(order[np.floor(own * share) != np.floor((own - 1) * share)])
+    return np.sort(order[np.floor(rank * share) != np.floor((rank - 1) * share)])
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -87,7 +80,7 @@ class OverlapEdges:
     def propose(self, frames: Sequence[Frame], clouds: CloudSet, world_from_cam: Floats) -> Edges:
         """Pairs whose IoU exceeds `min_iou`, with it; none for frames without points or a finite pose."""
         if len(usable_rows(clouds, world_from_cam)) < 2:
-            return Edges.proposed(np.zeros((0, 2), np.int64), "overlap")
+            return Edges.proposed(NO_PAIRS, "overlap")
         partners = some_of_each_place(world_from_cam, 2 * self.voxel_m)
         iou = pairwise_iou(clouds, world_from_cam, self.voxel_m, above=self.min_iou, partners=partners).tocoo()
         return Edges.proposed(np.stack([iou.row, iou.col], axis=1), "overlap", iou.data)

@@ -10,15 +10,20 @@ from pydantic.dataclasses import dataclass
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
-from hodge_pipeline.pairs.candidates import usable_rows
+from hodge_pipeline.pairs.candidates import NO_PAIRS, usable_rows
 from hodge_pipeline.pairs.drift import best_of_each
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Ints, PointCloud
 
 RINGS, SECTORS = 20, 60
-"""Of a context, as in the paper: 6 degrees, and 4 m for a scanner that sees 80 m."""
+"""Of a context, as Kim and Kim have them: 6 degrees, and 4 m for a scanner that sees 80 m."""
 GROUND_QUANTILE = 0.05
 """Heights are counted from the lowest points, which noise does not reach."""
-CLOUDS_IN_REACH = 50
+SAMPLED_CLOUDS = 50
+"""Of the median range that the rings divide: a limit on cost."""
+RANGE_QUANTILE = 0.99
+"""Of a cloud's horizontal distances: farther points are few, and would leave the outer rings empty."""
+FEWEST_COMMON = SECTORS / 4
+"""Columns over which a mean cosine is taken at least: fewer common ones count as so many, the others at 0."""
 BLUR_CELLS = 1.0
 """Sigma: two metres aside a facade stands in the next ring, where unblurred columns have nothing in common."""
 
@@ -50,8 +55,8 @@ class PlaceEdges:
         """Pairs at least `reach` apart where one sequence has both, with their similarity as overlap."""
         rows = usable_rows(clouds)
         if len(rows) < 2:
-            return Edges.proposed(np.zeros((0, 2), np.int64), "place")
-        some = rows[:: max(1, len(rows) // CLOUDS_IN_REACH)]
+            return Edges.proposed(NO_PAIRS, "place")
+        some = rows[:: max(1, len(rows) // SAMPLED_CLOUDS)]
         reach_m = float(np.median([_range_m(clouds[row]) for row in some.tolist()]))
         contexts = np.array([context(cloud, reach_m) for cloud in clouds.read(rows)])
         names = np.array([frames[row].sequence for row in rows], dtype=np.str_)
@@ -66,8 +71,8 @@ class PlaceEdges:
 
 
 def context(cloud: PointCloud, reach_m: float) -> Floats32:
-    """The greatest height (RINGS, SECTORS) over the ground of each cell of a polar grid about a scanner, metres; 0
-    where nothing stands.
+    """The scan context (RINGS, SECTORS): the greatest height over the ground in each cell of a polar grid about the
+    scanner's z axis, up to `reach_m` away, blurred; metres, 0 where nothing stands.
     """
     points = cloud.points_in_cam
     flat_m = np.hypot(points[:, 0], points[:, 1])
@@ -81,7 +86,7 @@ def context(cloud: PointCloud, reach_m: float) -> Floats32:
 
 
 def _range_m(cloud: PointCloud) -> float:
-    return float(np.quantile(np.hypot(*cloud.points_in_cam[:, :2].T), 0.99))
+    return float(np.quantile(np.hypot(*cloud.points_in_cam[:, :2].T), RANGE_QUANTILE))
 
 
 def _nearest_rings(contexts: Floats32, count: int) -> Ints:
@@ -94,13 +99,16 @@ def _nearest_rings(contexts: Floats32, count: int) -> Ints:
 
 
 def _similarity(contexts: Floats32, pairs: Ints) -> Floats:
-    """The mean cosine (P,) of the columns that both contexts of a pair have, in the turn where it is greatest."""
-    sizes = np.linalg.norm(contexts, axis=1)
-    unit = contexts / np.maximum(sizes, 1e-9)[:, None]
-    columns, filled = np.fft.rfft(unit, axis=2), np.fft.rfft(sizes > 0, axis=1)
+    """The mean cosine (P,) of the columns that both contexts of a pair have, in the turn where it is greatest.
+
+    All turns at once: the sums over columns are circular correlations, products after a Fourier transform.
+    """
+    norms = np.linalg.norm(contexts, axis=1)
+    unit = contexts / np.maximum(norms, 1e-9)[:, None]
+    columns, filled = np.fft.rfft(unit, axis=2), np.fft.rfft(norms > 0, axis=1)
     out = np.zeros(len(pairs))
     for at, (i, j) in enumerate(pairs.tolist()):
         cosines = np.fft.irfft((columns[i].conj() * columns[j]).sum(axis=0), SECTORS)
         common = np.fft.irfft(filled[i].conj() * filled[j], SECTORS)
-        out[at] = (cosines / np.maximum(common, SECTORS / 4)).max()
+        out[at] = (cosines / np.maximum(common, FEWEST_COMMON)).max()
     return np.clip(out, 0.0, 1.0)

@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.occupancy import voxels
+from hodge_pipeline.pairs.candidates import NO_PAIRS
 from hodge_pipeline.pairs.drift import displacement_m, median_range_m, path_length_m
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.pairs import PreparedClouds
@@ -81,7 +82,7 @@ def find_revisits(
     earlier views place a view alike, within the drift along the shortest path of steps and loops between them. The
     `known` loops come first.
     """
-    return _Path(clouds, world_from_cam, part, options, known or Edges.of(np.zeros((0, 2), np.int64))).found(advance)
+    return _Path(clouds, world_from_cam, part, options, known or Edges.of(NO_PAIRS)).found(advance)
 
 
 class _Path:

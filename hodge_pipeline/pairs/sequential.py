@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_pipeline.pairs.candidates import usable_rows
+from hodge_pipeline.pairs.candidates import NO_PAIRS, usable_rows
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame
 
 
@@ -32,4 +32,4 @@ class SequentialEdges:
             (chain[:-step], chain[step:]) for chain in chains for step in range(1, min(self.reach, len(chain)) + 1)
         ]
         pairs = [np.stack(step, axis=1) for step in steps]
-        return Edges.proposed(np.concatenate([np.zeros((0, 2), np.int64), *pairs]), "sequential")
+        return Edges.proposed(np.concatenate([NO_PAIRS, *pairs]), "sequential")

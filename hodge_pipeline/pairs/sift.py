@@ -12,9 +12,9 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.pairs.candidates import usable_rows
+from hodge_pipeline.pairs.candidates import NO_PAIRS, usable_rows
 from hodge_pipeline.pairs.sequential import SequentialEdges
-from hodge_pipeline.pairs.sift_similarity import global_descriptors, most_similar, vocabulary
+from hodge_pipeline.pairs.vlad import global_descriptors, most_similar, vocabulary
 from hodge_pipeline.registration.descriptors import CONFIDENCE, MOST_RANSAC_STEPS, match, root_sift
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame
 from hodge_pipeline.types.text import counted
@@ -58,7 +58,7 @@ class SiftEdges:
         """
         rows = usable_rows(clouds)
         if len(rows) < 2:
-            return Edges.proposed(np.zeros((0, 2), np.int64), "sift")
+            return Edges.proposed(NO_PAIRS, "sift")
         local = _Local(clouds)
         seen = np.array([row for row in rows.tolist() if len(local.points(row))], np.int64)
         if not len(seen):
@@ -70,22 +70,25 @@ class SiftEdges:
         return _verified(self, clouds, seen.tobytes(), near[np.isin(near, seen).all(axis=1)].tobytes())
 
 
-@lru_cache(maxsize=1)  # the next outer iteration asks again
+@lru_cache(maxsize=1)  # the next outer iteration asks the same; rows travel as bytes, which can be hashed
 def _verified(options: SiftEdges, clouds: CloudSet, seen: bytes, near: bytes) -> Edges:
-    """The pairs among the rows `seen`, of the neighbours `near` and those that look alike, that one motion explains."""
+    """The pairs that one motion explains, of the neighbours `near` and those that look alike.
+
+    `seen`: rows of the frames with landmarks, int64; `near`: pairs of them (P, 2), int64.
+    """
     local, rows = _Local(clouds), np.frombuffer(seen, np.int64)
     vectors = global_descriptors(local, rows, vocabulary(local, rows, WORDS, 0))
     similar = np.sort(rows[most_similar(vectors, options.similar_per_frame, options.reach)], axis=1)
     proposed = np.unique(np.concatenate([np.frombuffer(near, np.int64).reshape(-1, 2), similar]), axis=0)
     shares = np.zeros(len(proposed))
-    for place, (i, j) in enumerate(proposed.tolist()):
+    for at, (i, j) in enumerate(proposed.tolist()):
         matches = match(local.descriptors(i), local.descriptors(j), RATIO)
         if len(matches) <= options.min_inliers:
             continue
         points_i, points_j = local.points(i)[matches[:, 0]], local.points(j)[matches[:, 1]]
         inliers = count_inliers(points_i, points_j, local.pixel_rad((i, j)))
         if inliers > options.min_inliers:
-            shares[place] = inliers / min(len(local.points(i)), len(local.points(j)))
+            shares[at] = inliers / min(len(local.points(i)), len(local.points(j)))
     kept = shares > 0
     log.info("sift: %d of %d proposed pairs have more than %d matches", kept.sum(), len(kept), options.min_inliers)
     return Edges.proposed(proposed[kept], "sift", shares[kept])
@@ -114,7 +117,9 @@ class _Local:
 
 
 def count_inliers(slopes_i: Floats32, slopes_j: Floats32, pixel_rad: float) -> int:
-    """How many matched rays (M, 2) one essential matrix explains (RANSAC, five points): the same answer every time."""
+    """How many matched rays (M, 2) one essential matrix explains (RANSAC with five points, Nistér 2004); 0 of fewer
+    than eight. `pixel_rad`: the angle of a pixel. OpenCV seeds RANSAC itself: the same rays give the same number.
+    """
     if len(slopes_i) < 8:
         return 0
     model, inlier = cv2.findEssentialMat(

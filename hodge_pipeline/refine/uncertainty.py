@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.judging import chi2_by_information
+from hodge_pipeline.complex.chi2 import chi2_by_information
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.refine.guard import PoseChange
 from hodge_pipeline.solvers.covariance import marginal_covariances

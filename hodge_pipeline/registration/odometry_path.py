@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.chi2 import FREEDOM, tail_gate
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.complex.judging import FREEDOM, tail_gate
 from hodge_pipeline.scene import Drift
 from hodge_pipeline.types import Bools, Edges, Floats, Ints
 

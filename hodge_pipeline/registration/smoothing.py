@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.judging import tail_weight
+from hodge_pipeline.complex.chi2 import tail_weight
 from hodge_pipeline.one_blas_thread import one_blas_thread
 from hodge_pipeline.types import Floats
 

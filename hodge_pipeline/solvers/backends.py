@@ -28,9 +28,9 @@ WIDEST = 20.0
 towns of 20,000 to 80,000 poses are up to 16. Of wider ones, as in a tangle, the order itself would cost too much.
 """
 SECONDS_A_BLOCK = 2e-5
-"""Measured, of one Newton step: of blocks of the matrix by multigrid."""
+"""Seconds of a Newton step by multigrid, for each block of its matrix: measured."""
 LAPLACIAN_STEPS = 20
-"""Of CG with the scalar Laplacians to a Newton step of such towns."""
+"""Steps of CG with the scalar Laplacians for a Newton step of such towns."""
 JOINT_SIZE = 6
 """Rows of a block of rotations and translations together."""
 SCALAR_TOLERANCE, MAX_SCALAR_STEPS = 1e-12, 300
@@ -40,11 +40,10 @@ SCALAR_TOLERANCE, MAX_SCALAR_STEPS = 1e-12, 300
 def choose(
     name: BackendName, tail: Ints, head: Ints, count: int, direct: bool = False
 ) -> tuple[Preconditioning | None, Elimination]:
-    """What preconditions linear systems of a graph, None where they are factorised, and its plan of elimination; edges
-    (tail, head), `count` vertices that are not pinned.
+    """What preconditions linear systems of a graph, None where they are factorised, and its plan of elimination.
 
-    `auto` is the cheaper of a factorisation, whose fill is foretold, and multigrid; where one will be needed
-    (`direct`), it is a factorisation.
+    Of edges (tail, head), those with an end at or past `count` lead to pinned vertices. `auto` is the cheaper of a
+    factorisation, whose fill is foretold, and multigrid; where one will be needed (`direct`), it is a factorisation.
     """
     if name == "multigrid":
         return _multigrid(), unordered(count)
@@ -75,7 +74,7 @@ def _width(core: csc_matrix) -> float:
 
 
 def laplacian_factor(laplacian: csc_matrix, precondition: Preconditioning | None) -> Factor:
-    """What solves with a scalar Laplacian (n, n) in the order of elimination, to the rounding of a factor."""
+    """What solves with a scalar Laplacian (n, n), its rows in the order of elimination, to the rounding of a factor."""
     if precondition is None or not laplacian.shape[0]:
         return factorise(laplacian, "NATURAL")
     matrix = csr_matrix(laplacian)

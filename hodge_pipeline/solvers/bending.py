@@ -11,13 +11,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh
 from scipy.sparse import coo_matrix, csr_matrix, kron
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.judging import residual_twists
+from hodge_pipeline.complex.chi2 import residual_twists
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 MOST_PIECES = 96
@@ -92,8 +93,30 @@ class _NodeLayout:
         return kron(shares, np.eye(6), format="csr")
 
 
-_Level = tuple[_NodeLayout, csr_matrix, Floats]
-"""A layout of nodes, its matrix, and the stiffness of the edges in the twists of its bending nodes."""
+class _Level(NamedTuple):
+    """A layout of nodes, its `matrix (6 V, 6 K)`, and the stiffness of the edges in the twists of its bending nodes."""
+
+    layout: _NodeLayout
+    matrix: csr_matrix
+    stiffness: Floats
+
+
+class _Fit(NamedTuple):
+    """The factor on the covariance of edges over long paths, how finely they bend, and the factor on points' sigma."""
+
+    softness: float
+    level: _Level
+    point_factor: float
+
+
+class _Spectrum(NamedTuple):
+    """By how much the rigid twists of pieces lower χ²; and of each bending mode the ratio of the information of points
+    to the stiffness of edges, and the squared force of points on it.
+    """
+
+    rigid_gain: float
+    ratios: Floats
+    squared_forces: Floats
 
 
 class Bending:
@@ -112,7 +135,7 @@ class Bending:
         for layout in _layouts(rest, pieces):
             matrix = layout.matrix
             bends = matrix[:, 6 * len(pieces) :]
-            self._levels.append((layout, matrix, (bends.T @ stiffness @ bends).toarray()))
+            self._levels.append(_Level(layout, matrix, (bends.T @ stiffness @ bends).toarray()))
 
     def towards(
         self, vertices: Ints, arms: Floats, known: Floats, covariances: Floats, least: float, finest: bool = False
@@ -143,24 +166,24 @@ class Bending:
         edge_factor = float(np.sqrt(softness)) * point_factor
         return Bent(_shifted(poses, self._centre), edge_factor, point_factor, spread, self._centre, layout)
 
-    def _likeliest(self, points: Points, least: float, levels: list[_Level]) -> tuple[float, _Level, float]:
-        """The softness of edges, the level, and the factor on the sigma of points, with the largest evidence."""
+    def _likeliest(self, points: Points, least: float, levels: list[_Level]) -> _Fit:
+        """The fit of the largest evidence, its factor on the sigma of points `least` or more (MacKay 1992)."""
         matrix, right = points.model(len(self._rest))
         misfit = float(np.einsum("ni,nij,nj->", points.left, points.information, points.left))
-        best = (-np.inf, 1.0, levels[0], 1.0)
+        best, highest = _Fit(1.0, levels[0], 1.0), -np.inf
         for level in levels:
             layout, twists, stiffness = level
-            gained, values, weights = _spectrum(
+            rigid_gain, ratios, squared_forces = _spectrum(
                 (twists.T @ matrix @ twists).toarray(), twists.T @ right, stiffness, 6 * layout.pieces
             )
             free = 3 * len(points.left) - 6 * layout.pieces
             for softness in SOFTNESS:
-                left = max(misfit - gained - float((weights / (values + 1 / softness)).sum()), 0.0)
+                left = max(misfit - rigid_gain - float((squared_forces / (ratios + 1 / softness)).sum()), 0.0)
                 factor = max(np.sqrt(left / max(free, 1)), least)
-                evidence = -left / (2 * factor**2) - free * np.log(factor) - np.log1p(softness * values).sum() / 2
-                if evidence > best[0]:
-                    best = (evidence, float(softness), level, factor)
-        return best[1:]
+                evidence = -left / (2 * factor**2) - free * np.log(factor) - np.log1p(softness * ratios).sum() / 2
+                if evidence > highest:
+                    best, highest = _Fit(float(softness), level, factor), evidence
+        return best
 
     def _stiffness(self, poses: Floats) -> tuple[csr_matrix, Floats]:
         """Gauss-Newton Hessian and gradient of half of χ² of all edges, in twists of the poses in the world."""
@@ -176,20 +199,20 @@ class Bending:
         return _blocks(ends, np.concatenate([block, block, -block, -block]), len(poses)), total.ravel()
 
 
-def _spectrum(of_points: Floats, pull: Floats, stiffness: Floats, free: int) -> tuple[float, Floats, Floats]:
-    """By how much the first `free` unknowns, on which edges have no information, lower χ²; then, for each generalised
-    eigenvector of the information of points against the stiffness of edges, its eigenvalue and squared force.
+def _spectrum(of_points: Floats, pull: Floats, stiffness: Floats, free: int) -> _Spectrum:
+    """The modes of points against edges: eigenvectors of the information of points relative to the stiffness of edges,
+    once the first `free` unknowns, on which edges have no information, are eliminated.
     """
     solved = np.linalg.solve(_damped(of_points[:free, :free]), np.column_stack([of_points[:free, free:], pull[:free]]))
     others = of_points[free:, free:] - of_points[free:, :free] @ solved[:, :-1]
     force = pull[free:] - of_points[free:, :free] @ solved[:, -1]
-    gained = float(pull[:free] @ solved[:, -1])
+    rigid_gain = float(pull[:free] @ solved[:, -1])
     if not len(stiffness):
-        return gained, np.zeros(0), np.zeros(0)
+        return _Spectrum(rigid_gain, np.zeros(0), np.zeros(0))
     size = np.sqrt(np.diag(stiffness))
     held = stiffness / np.outer(size, size) + DAMPING**1.5 * np.eye(len(size))
     values, vectors = eigh(others / np.outer(size, size), held)
-    return gained, np.maximum(values, 0.0), (vectors.T @ (force / size)) ** 2
+    return _Spectrum(rigid_gain, np.maximum(values, 0.0), (vectors.T @ (force / size)) ** 2)
 
 
 def _damped(matrix: Floats) -> Floats:
@@ -239,6 +262,7 @@ def _lever(points: Floats) -> Floats:
 
 
 def _shifted(poses: Floats, shift: Floats) -> Floats:
+    """The poses (V, 4, 4) moved by a shift (3,)."""
     out = poses.copy()
     out[:, :3, 3] += shift
     return out

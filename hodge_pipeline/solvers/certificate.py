@@ -26,9 +26,11 @@ RELATIVE_GAP = 1e-6
 BRACKET = 8.0
 """The factor between the shifts that are tried until a matrix is definite."""
 MAX_BRACKETS = 40
+"""Shifts that are tried: they reach 10³⁶ times the first."""
 GAP_STEP = 4.0
 """The factor between the gaps that are tried for a bound: each costs a factorisation."""
 EIGENVALUE_TOLERANCE = 1e-3
+"""Relative: the eigenvector is a direction to descend along, the eigenvalue a first guess of the gap."""
 ABOVE = 1.01
 """The first gap that is tried, relative to the one from the smallest eigenvalue."""
 FIRST_SHIFT = 1e-3
@@ -37,10 +39,10 @@ FIRST_SHIFT = 1e-3
 
 @dataclass(frozen=True)
 class Certificate:
-    """The answer: `optimal`, with every eigenvalue ≥ −shift and `gap_bound` ≥ F − F_optimal when it is.
+    """The answer: `optimal`, with every eigenvalue of Q − Λ ≥ −shift and `gap_bound` ≥ F − F_optimal when it is.
 
-    When it is not, `smallest_eigenvalue` is that of Q − Λ, and `direction (n, d)` its eigenvector: where F falls once
-    the rotations may leave their space.
+    When it is not, `smallest_eigenvalue` is that of Q − Λ, NaN where it was not found, and `direction (n, d)` its
+    eigenvector: where F falls once the rotations may turn into another dimension.
     """
 
     optimal: bool
@@ -103,7 +105,9 @@ def _blocks(problem: Problem, edges: slice) -> Floats:
 
 
 def certify(problem: Problem, rotations: Floats, translations: Floats, cost: float) -> Certificate:
-    """The certificate of the poses in the problem's order, where its components are pinned by one vertex each."""
+    """The certificate of a critical point: rotations (n, d, d) and translations (n, d) in the problem's order, where
+    its components are pinned by one vertex each, and their F, `cost`.
+    """
     d = problem.dimension
     scale = _scale(problem)
     rank = d * problem.count
@@ -124,12 +128,13 @@ def certify(problem: Problem, rotations: Floats, translations: Floats, cost: flo
     direction = None
     if vector is not None:
         direction = np.empty((problem.count, d))
-        direction[order] = vector[on_rotations > 0].reshape(problem.count, d)
+        direction[order] = vector.reshape(problem.count, d)
     note = f"not certified as the global minimum: {negative} negative eigenvalues, the smallest {smallest:.6g}"
     return Certificate(False, shift, np.inf, note, smallest, direction)
 
 
 def _scale(problem: Problem) -> float:
+    """The median κ, 1 without edges: what shifts are relative to."""
     return float(np.median(problem.kappa)) if len(problem.kappa) else 1.0
 
 
@@ -224,11 +229,12 @@ def _rows(problem: Problem, order: Ints) -> Ints:
 
 
 def _shifted(matrix: csc_matrix, shift: float, on_rotations: Floats) -> csc_matrix:
+    """The matrix whose Schur complement over the translations is Q − Λ + shift · I."""
     return csc_matrix(matrix + diags_array(shift * on_rotations))
 
 
 def _smallest_eigenvalue(matrix: csc_matrix, shift: float, on_rotations: Floats) -> tuple[float, Floats | None]:
-    """The smallest eigenvalue of the Schur complement Q − Λ, below −shift, and its vector with zeros at translations.
+    """The smallest eigenvalue of the Schur complement Q − Λ, below −shift, and its vector on the rows of rotations.
 
     By Lanczos on the inverse of Q − Λ + s · I for the first s in a geometric row that makes it definite, so that the
     wanted eigenvalue lies apart from all others. NaN and None where that does not settle.
@@ -247,6 +253,4 @@ def _smallest_eigenvalue(matrix: csc_matrix, shift: float, on_rotations: Floats)
         values, vectors = eigsh(operator, k=1, which="LA", v0=begin, tol=EIGENVALUE_TOLERANCE)
     except ArpackError:
         return math.nan, None
-    out = np.zeros(len(on_rotations))
-    out[rows] = vectors[:, 0]
-    return float(1 / values[0] - shift), out
+    return float(1 / values[0] - shift), vectors[:, 0]

@@ -1,28 +1,31 @@
-"""Block elimination of a graph's vertices of low degree, many at a time: chains and ladders need no library.
+"""The plan of a block elimination: in which order a graph's vertices go, many at a time, and what fill they leave.
 
 Each round takes an independent set of vertices of few neighbours. What is left, the core, is small on graphs that are
 like trajectories, and goes to a sparse direct solver. Rounds and fill depend on the graph alone: planned once, then
-used for matrices with blocks of any size.
+used for matrices with blocks of any size (solvers/block_factor.py).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
-from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
+from scipy.sparse import csc_matrix, csr_matrix
 
-from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types import Bools, Ints
 
 MOST_NEIGHBOURS = 8
 """A vertex of more stays in the core: there a library's dense blocks are faster."""
 SMALLEST_ROUND = 0.02
 """Of the vertices left: smaller rounds are not worth their overhead."""
 FEWEST_IN_ROUND = 2000
+"""Vertices, for the same reason."""
 PASSES = 3
+"""Of Luby's algorithm in a round: what they leave out is there for the next."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class Ordering:
 class Group:
     """Vertices of one round with k neighbours each, which later rounds or the core hold.
 
-    - `begin`, `end`: their positions; `neighbours (m, k)` the positions of theirs, ascending.
+    - `begin`, `end`: their positions in the order; `neighbours (m, k)` the positions of theirs, ascending.
     - `slots`: of their blocks above the diagonal, vertex by vertex.
     - `scatter`: sums what their elimination adds, pair a ≤ b by pair of neighbours, into `targets`, which count the
       diagonal blocks first and then the others.
@@ -139,20 +142,21 @@ def plan_elimination(
         touched = chosen[low] | chosen[high]
         vertex = np.where(chosen[low], low, high)[touched]
         other = (low + high)[touched] - vertex
-        fill = []
-        for vertices, neighbours in _by_degree(np.flatnonzero(chosen), vertex, other):
-            rounds.append((vertices, neighbours))
-            k = neighbours.shape[1]
-            for a in range(k):
-                for b in range(a + 1, k):
-                    first, second = neighbours[:, a], neighbours[:, b]
-                    fill.append(np.minimum(first, second) * count + np.maximum(first, second))
-        pairs = _merged(pairs[~touched], fill)
+        groups = _by_degree(np.flatnonzero(chosen), vertex, other)
+        rounds += groups
+        pairs = _merged(pairs[~touched], [keys for _, neighbours in groups for keys in _fill(neighbours, count)])
         alive &= ~chosen
         left = int(alive.sum())
     rest = np.flatnonzero(alive)
     low, high = np.divmod(pairs, count)
     return _planned(count, rounds, _ordered_core(rest, low, high, count, core_order), low, high)
+
+
+def _fill(neighbours: Ints, count: int) -> Iterator[Ints]:
+    """The keys (m,) of the edges that eliminating m vertices adds: each two of their neighbours (m, k) are joined."""
+    for a, b in combinations(range(neighbours.shape[1]), 2):
+        first, second = neighbours[:, a], neighbours[:, b]
+        yield np.minimum(first, second) * count + np.maximum(first, second)
 
 
 def _merged(ascending: Ints, more: list[Ints]) -> Ints:
@@ -229,6 +233,7 @@ def _ordered_core(
 
 
 def _planned(count: int, rounds: list[tuple[Ints, Ints]], core: Ordering, low: Ints, high: Ints) -> Elimination:
+    """The plan of rounds, vertices (m,) with their neighbours (m, k), and a core with edges (low, high)."""
     order = np.concatenate([*(vertices for vertices, _ in rounds), core.order]).astype(np.int64)
     position = np.empty(count, np.int64)
     position[order] = np.arange(count)
@@ -255,6 +260,7 @@ def _planned(count: int, rounds: list[tuple[Ints, Ints]], core: Ordering, low: I
 
 
 def _scatter(near: Ints, keys: Ints, count: int) -> tuple[Ints, csr_matrix]:
+    """A group's `targets` and `scatter`, from its neighbours (m, k) and the ascending `keys` of all slots."""
     k = near.shape[1]
     targets = [
         near[:, a] if a == b else count + np.searchsorted(keys, near[:, a] * count + near[:, b])
@@ -266,121 +272,3 @@ def _scatter(near: Ints, keys: Ints, count: int) -> tuple[Ints, csr_matrix]:
     unique, inverse = np.unique(np.concatenate(targets), return_inverse=True)
     entries = np.ones(len(inverse)), (inverse.reshape(-1), np.arange(len(inverse)))
     return unique.astype(np.int64), csr_matrix(entries, shape=(len(unique), len(inverse)))
-
-
-@dataclass(frozen=True)
-class BlockFactor:
-    """A block matrix after its elimination: `pivots (core, s, s)` inverted, `rows (slots, s, s)` divided by them."""
-
-    plan: Elimination
-    pivots: Floats
-    rows: Floats
-    solve_core: Callable[[Floats], Floats]
-
-    def solve(self, rhs: Floats) -> Floats:
-        """The solution of `matrix @ x = rhs`, of the right-hand side's shape (n · s,) or (n · s, c)."""
-        size = self.pivots.shape[-1]
-        x = np.array(rhs, self.rows.dtype).reshape(self.plan.size, size, -1)
-        columns = x.shape[-1]
-        for group in self.plan.groups:
-            own = x[group.begin : group.end]
-            if group.neighbours.shape[1]:
-                blocks = self.rows[group.slots].reshape(*group.neighbours.shape, size, size)
-                passed = np.matmul(blocks.transpose(0, 1, 3, 2), own[:, None])
-                moved = group.gather @ passed.reshape(-1, size * columns)
-                x[group.reached] -= moved.reshape(-1, size, columns)
-        core = self.plan.core
-        if core < self.plan.size:
-            x[core:] = self.solve_core(x[core:].reshape(-1, columns)).reshape(-1, size, columns)
-        for group in reversed(self.plan.groups):
-            count, k = group.neighbours.shape
-            wide = side_by_side(self.rows[group.slots].reshape(count, k, size, size))
-            own = self.pivots[group.begin : group.end] @ x[group.begin : group.end]
-            x[group.begin : group.end] = own - wide @ x[group.neighbours].reshape(count, k * size, columns)
-        return np.asarray(x.reshape(rhs.shape), float)
-
-
-def side_by_side(blocks: Floats) -> Floats:
-    """Blocks (m, k, s, s) as one (m, s, k · s) of each vertex: one product in place of k."""
-    count, k, size, _ = blocks.shape
-    return blocks.transpose(0, 2, 1, 3).reshape(count, size, k * size)
-
-
-def eliminate(
-    plan: Elimination, matrix: bsr_matrix, factorise_core: Callable[[csc_matrix], Callable[[Floats], Floats]]
-) -> BlockFactor:
-    """The factor of a symmetric positive definite block matrix whose rows are in the plan's order."""
-    return eliminate_blocks(plan, *_unpacked(plan, matrix), factorise_core)
-
-
-def eliminate_blocks(
-    plan: Elimination,
-    diagonal: Floats,
-    rows: Floats,
-    factorise_core: Callable[[csc_matrix], Callable[[Floats], Floats]],
-) -> BlockFactor:
-    """The factor of the matrix of these blocks: `diagonal (n, s, s)`, and `rows (slots, s, s)` above it; both are
-    overwritten.
-    """
-    size = diagonal.shape[-1]
-    flat = diagonal.reshape(-1, size * size), rows.reshape(-1, size * size)
-    for group in plan.groups:
-        _eliminate_group(group, diagonal, rows, flat)
-    core = _core_matrix(plan, diagonal, rows) if plan.core < plan.size else None
-    solve_core = (lambda rhs: rhs) if core is None else factorise_core(core)
-    end = plan.groups[-1].slots.stop if plan.groups else 0
-    return BlockFactor(plan, diagonal[: plan.core], rows[:end], solve_core)
-
-
-def _unpacked(plan: Elimination, matrix: bsr_matrix) -> tuple[Floats, Floats]:
-    """The diagonal blocks and those above the diagonal, with zeros for the fill."""
-    size, n = matrix.blocksize[0], plan.size
-    at = np.repeat(np.arange(n), np.diff(matrix.indptr))
-    columns = matrix.indices.astype(np.int64)
-    diagonal = np.zeros((n, size, size), matrix.data.dtype)
-    on = at == columns
-    diagonal[at[on]] = matrix.data[on]
-    rows = np.zeros((len(plan.slot_rows), size, size), matrix.data.dtype)
-    above = np.flatnonzero(at < columns)
-    rows[np.searchsorted(plan.keys, at[above] * n + columns[above])] = matrix.data[above]
-    return diagonal, rows
-
-
-def _eliminate_group(group: Group, diagonal: Floats, rows: Floats, flat: tuple[Floats, Floats]) -> None:
-    size, (count, k) = rows.shape[-1], group.neighbours.shape
-    pivots = diagonal[group.begin : group.end]
-    pivots[:] = np.linalg.inv(pivots)
-    if not k:
-        return
-    blocks = rows[group.slots].reshape(count, k, size, size)
-    wide = side_by_side(blocks)
-    divided = pivots @ wide
-    added, row = np.empty((k * (k + 1) // 2, count, size, size), rows.dtype), 0
-    for a in range(k):
-        with_later = wide[:, :, a * size : (a + 1) * size].transpose(0, 2, 1) @ divided[:, :, a * size :]
-        added[row : row + k - a] = with_later.reshape(count, size, k - a, size).transpose(2, 0, 1, 3)
-        row += k - a
-    total = group.scatter @ added.reshape(-1, size * size)
-    on = int(np.searchsorted(group.targets, len(diagonal)))
-    flat[0][group.targets[:on]] -= total[:on]
-    flat[1][group.targets[on:] - len(diagonal)] -= total[on:]
-    blocks[:] = divided.reshape(count, size, k, size).transpose(0, 2, 1, 3)
-
-
-def _core_matrix(plan: Elimination, diagonal: Floats, rows: Floats) -> csc_matrix:
-    begin, size = plan.core, rows.shape[-1]
-    first = plan.groups[-1].slots.stop if plan.groups else 0
-    at, columns = plan.slot_rows[first:] - begin, plan.slot_columns[first:] - begin
-    count = plan.size - begin
-    i = np.concatenate([np.arange(count), at, columns])
-    j = np.concatenate([np.arange(count), columns, at])
-    data = np.concatenate([diagonal[begin:], rows[first:], rows[first:].transpose(0, 2, 1)])
-    order = np.lexsort((j, i))
-    indptr = np.searchsorted(i[order], np.arange(count + 1))
-    return by_columns(bsr_matrix((data[order], j[order], indptr), shape=(count * size, count * size)))
-
-
-def by_columns(matrix: bsr_matrix) -> csc_matrix:
-    """A symmetric matrix by its columns, which are its rows."""
-    rows = matrix.tocsr()
-    return csc_matrix((rows.data, rows.indices, rows.indptr), shape=rows.shape)

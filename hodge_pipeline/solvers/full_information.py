@@ -71,7 +71,7 @@ class FullObjective:
 
     problem: Problem
     information: Floats
-    direct: DirectSolver | IterativeSolver
+    solver: DirectSolver | IterativeSolver
 
     @classmethod
     def of(cls, problem: Problem, information: Floats) -> FullObjective:
@@ -86,17 +86,17 @@ class FullObjective:
     def step(self, point: Point, tolerance: float, enough: float) -> Step:
         """A Gauss-Newton step by PCG: first with the two Laplacians, with a direct factor once they prove too weak."""
         assert isinstance(point, FullPoint)
-        if isinstance(self.direct, IterativeSolver):
-            self.direct.look(self.problem.tau, point.left.reach)
+        if isinstance(self.solver, IterativeSolver):
+            self.solver.look(self.problem.tau, point.left.reach)
         gradient, hessian = self.normal_equations(point.left)
-        spent, tried = 0, self.direct.steps_to_try(hessian.blocksize[0])
+        spent, tried = 0, self.solver.steps_to_try(hessian.blocksize[0])
         if tried:
             apply, precondition = (lambda x: np.asarray(hessian @ x)), self.laplacian_preconditioner(point.rotations)
             found = truncated_cg(apply, precondition, gradient, tolerance, tried, enough)
             spent = found.steps
-            self.direct.tried += spent
+            self.solver.tried += spent
         if spent >= tried:
-            found = self.direct.solve(
+            found = self.solver.solve(
                 hessian, gradient, tolerance, enough, point.translations[: self.problem.free_count]
             )
             spent += found.steps

@@ -102,7 +102,7 @@ class JointObjective:
     """
 
     problem: Problem
-    direct: DirectSolver | IterativeSolver
+    solver: DirectSolver | IterativeSolver
     matching: TranslationSolver | None = None
 
     @classmethod
@@ -123,12 +123,12 @@ class JointObjective:
         """A Gauss-Newton step."""
         assert isinstance(point, IsotropicPoint)
         slopes, near = gradient(self.problem, point.left).reshape(-1), tolerance < NEWTON_FROM
-        if isinstance(self.direct, IterativeSolver):
-            found = self._iterated(self.direct, point, slopes, tolerance, enough, near)
+        if isinstance(self.solver, IterativeSolver):
+            found = self._iterated(self.solver, point, slopes, tolerance, enough, near)
         else:
             positions = point.translations[: self.problem.free_count]
-            found = self.direct.solve(self.normal_matrix(point.left), slopes, tolerance, enough, positions)
-            exact = self.direct.refined(self.hessian(point.left), slopes, enough) if near else None
+            found = self.solver.solve(self.normal_matrix(point.left), slopes, tolerance, enough, positions)
+            exact = self.solver.refined(self.hessian(point.left), slopes, enough) if near else None
             found = exact if exact is not None else found
         slope = 2 * float(slopes @ found.x)
         return Step(found.x, slope, -0.5 * slope - float(found.x @ found.residual), found.steps)

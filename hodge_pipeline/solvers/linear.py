@@ -10,7 +10,8 @@ from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.elimination import Elimination, Ordering, by_columns, eliminate
+from hodge_pipeline.solvers.block_factor import by_columns, eliminate
+from hodge_pipeline.solvers.elimination import Elimination, Ordering
 from hodge_pipeline.types import Floats
 
 MINIMUM_DEGREE_TO = 300_000

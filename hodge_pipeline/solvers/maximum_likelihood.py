@@ -19,8 +19,8 @@ from hodge_pipeline.one_blas_thread import one_blas_thread
 from hodge_pipeline.solvers.backends import BackendName
 from hodge_pipeline.solvers.certificate import Certificate, bounded, certify
 from hodge_pipeline.solvers.escape import escape
-from hodge_pipeline.solvers.minimise import at_start, metrics_of, minimise
-from hodge_pipeline.solvers.newton import ROUNDING_REACHED, Limits, Point
+from hodge_pipeline.solvers.minimise import Watch, at_start, metrics_of, minimise
+from hodge_pipeline.solvers.newton import ROUNDING_REACHED, Descent, Limits, Point
 from hodge_pipeline.solvers.priors import with_world, without_world
 from hodge_pipeline.solvers.reweighted import reweighted
 from hodge_pipeline.solvers.setup import InitialName, Setup, check_choice, held_rows, prepare
@@ -70,34 +70,14 @@ def solve(
     Raises `GraphError` for motions that are not finite and rigid, edges and fixed rows that name no vertex, and
     unknown options.
     """
-    check_choice("objective", objective, ObjectiveName)
-    check_choice("initial", initial, InitialName)
-    if not time_limit_s > 0:
-        raise GraphError(f"time_limit_s is {time_limit_s:g}: expected seconds above zero")
-    check_rows(graph.fixed if fixed is None else np.asarray(fixed), graph.vertex_count, "fixed")
     start = None if start is None else np.asarray(start, float)
-    if start is None and (initial == "given" or (fixed is not None and len(fixed))):
-        raise GraphError("fixed vertices and a given initial guess need start poses: pass start")
-    priors = graph.priors if priors is None else priors
+    _check_options(graph, start, objective, initial, fixed, time_limit_s)
+    whole, priors = graph, graph.priors if priors is None else priors
     if priors is not None and len(priors.vertices):
-        whole, poses = with_world(graph, priors, start, fixed)
-        solution = solve(
-            whole,
-            start=poses,
-            objective=objective,
-            initial=initial,
-            backend=backend,
-            dimension=dimension,
-            certificate=certificate,
-            max_iterations=max_iterations,
-            relative_tolerance=relative_tolerance,
-            time_limit_s=time_limit_s,
-            keep_history=keep_history,
-        )
-        return without_world(solution, graph)
-    rows, unheld = held_rows(graph, start, fixed)
-    setup = prepare(graph, start, rows, dimension, backend, direct=certificate)
-    notes = [*unheld, *setup.weights.notes, *describe_components(setup.component, graph.vertex_ids)]
+        (whole, start), fixed = with_world(graph, priors, start, fixed), None
+    rows, unheld = held_rows(whole, start, fixed)
+    setup = prepare(whole, start, rows, dimension, backend, direct=certificate)
+    notes = [*unheld, *setup.weights.notes, *describe_components(setup.component, whole.vertex_ids)]
     if not setup.weights.used.any():
         notes.append(NO_EDGES)
     full = objective == "full" and setup.weights.definite
@@ -111,40 +91,57 @@ def solve(
 
     limits = Limits(max_iterations, relative_tolerance, time.monotonic() + time_limit_s)
     descent = minimise(setup, initial, limits, full, watch)
-    metrics = metrics_of(descent, full)
-    if start is not None:
-        metrics["objective_at_start"] = at_start(setup, full).point.cost
-    certified: bool | None = None
+    answer: Certificate | None = None
     if certificate and full:
         notes.append("only the isotropic objective can be certified")
     elif certificate:
-        answer = _certify(setup, descent.point)
-        if not answer.optimal and answer.direction is not None:
-            found = escape(setup, descent.point, answer, limits, watch)
-            if found.descent is not None:
-                notes.append(f"a local minimum, F = {descent.point.cost:.9g}, was escaped")
-                descent = found.descent
-                metrics |= metrics_of(descent, full)
-            answer = bounded(found.certificate, descent.point.cost, found.bound)
+        local = descent
+        descent, answer = _certified(setup, local, limits, watch)
+        if descent is not local:
+            notes.append(f"a local minimum, F = {local.point.cost:.9g}, was escaped")
         notes.append(answer.note)
-        certified = answer.optimal
+    metrics = metrics_of(descent, full)
+    if start is not None:
+        metrics["objective_at_start"] = at_start(setup, full).point.cost
+    if answer is not None:
         metrics["gap_bound"] = answer.gap_bound
         metrics |= {} if answer.optimal else {"smallest_eigenvalue": answer.smallest_eigenvalue}
     if not descent.converged:
         why = f"{descent.reason} after {counted(len(descent.costs) - 1, 'step')}: these are the best poses so far"
         notes.append(f"{why}; {WILD_NUMBERS}" if descent.reason == ROUNDING_REACHED else why)
-    weights = setup.weights.used.astype(float)
-    return Solution(
-        setup.poses(descent.point), setup.component, weights, tuple(history), metrics, tuple(notes),
-        converged=descent.converged, stopped_by=descent.reason, certified=certified,
+    solution = Solution(
+        setup.poses(descent.point), setup.component, setup.weights.used.astype(float), tuple(history), metrics,
+        tuple(notes), converged=descent.converged, stopped_by=descent.reason,
+        certified=None if answer is None else answer.optimal,
     )  # fmt: skip
+    return solution if whole is graph else without_world(solution, graph)
 
 
-def _certify(setup: Setup, point: Point) -> Certificate:
-    problem = setup.problem
+def _check_options(
+    graph: ViewGraph, start: Floats | None, objective: str, initial: str, fixed: Ints | None, time_limit_s: float
+) -> None:
+    check_choice("objective", objective, ObjectiveName)
+    check_choice("initial", initial, InitialName)
+    if not time_limit_s > 0:
+        raise GraphError(f"time_limit_s is {time_limit_s:g}: expected seconds above zero")
+    check_rows(graph.fixed if fixed is None else np.asarray(fixed), graph.vertex_count, "fixed")
+    if start is None and (initial == "given" or (fixed is not None and len(fixed))):
+        raise GraphError("fixed vertices and a given initial guess need start poses: pass start")
+
+
+def _certified(setup: Setup, descent: Descent, limits: Limits, watch: Watch) -> tuple[Descent, Certificate]:
+    """The lowest isotropic minimum that the staircase finds from a descent's end, and its certificate; the same descent
+    where its end is optimal, or nothing leads lower.
+    """
+    problem, point = setup.problem, descent.point
     if problem.count - problem.free_count > setup.component.max(initial=-1) + 1:
-        return Certificate(False, 0.0, math.inf, SEVERAL_FIXED)
-    return certify(problem, point.rotations, point.translations, point.cost)
+        return descent, Certificate(False, 0.0, math.inf, SEVERAL_FIXED)
+    answer = certify(problem, point.rotations, point.translations, point.cost)
+    if answer.optimal or answer.direction is None:
+        return descent, answer
+    found = escape(setup, point, answer, limits, watch)
+    lowest = found.descent or descent
+    return lowest, bounded(found.certificate, lowest.point.cost, found.bound)
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))

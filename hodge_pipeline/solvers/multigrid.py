@@ -2,7 +2,8 @@
 
 Vaněk, Mandel and Brezina 1996, with the motions of a rigid body in the place of elasticity's: a cluster of poses that
 moves as one leaves the edges within it as they are, so that one coarse vertex can stand for it. Such modes are what the
-scalar Laplacians miss, whose levers couple rotations to translations.
+scalar Laplacians miss, whose levers couple rotations to translations. Matrices are (n · s, n · s), of n vertices with
+s unknowns each.
 """
 
 from __future__ import annotations
@@ -29,9 +30,12 @@ CHUNK, ROWS = 1 << 14, 1 << 11
 """Blocks, and block rows of a coarser matrix, that are taken at a time: their copies stay small."""
 LEAST_COARSENING = 0.8
 """Of the vertices: a level that leaves more costs more than it saves."""
+DAMPING = 4 / 3
+"""Over the spectral radius of D⁻¹ A: the paper's, which damps the upper half of the spectrum most evenly."""
 POWER_STEPS, SAFE_RADIUS = 10, 1.05
 """The power method's estimate is a lower bound of the spectral radius."""
 CoarseSolver: TypeAlias = Callable[[csc_matrix], Callable[[Floats], Floats]]
+"""matrix -> (r -> x): the exact solution of the coarsest level."""
 
 
 @dataclass(frozen=True)
@@ -151,11 +155,13 @@ def _worth_a_factor(matrix: bsr_matrix, finest: int) -> bool:
 
 
 def _pattern(matrix: bsr_matrix) -> csr_matrix:
+    """The matrix (n, n) of ones where a block is stored."""
     count = len(matrix.indptr) - 1
     return csr_matrix((np.ones(len(matrix.indices), np.float32), matrix.indices, matrix.indptr), shape=(count, count))
 
 
 def _as_blocks(matrix: bsr_matrix, size: int) -> bsr_matrix:
+    """The matrix in square blocks of this size, sorted within their rows."""
     out = matrix.tobsr((size, size))
     out.sort_indices()
     return out
@@ -180,11 +186,11 @@ def aggregates(matrix: bsr_matrix) -> Ints:
 
 
 def _level(matrix: bsr_matrix, blocks: Floats, aggregate: Ints, count: int) -> Level:
-    """The level with prolongation (I − ω D⁻¹ A) P, where P moves each aggregate as one."""
+    """The level with prolongation (I − ω D⁻¹ A) P, where P (`blocks (n, s, s)`) moves each aggregate as one."""
     size, n = matrix.blocksize[0], len(aggregate)
     rows = np.repeat(np.arange(n, dtype=np.int32), np.diff(matrix.indptr))
     damped = np.linalg.inv(matrix.data[rows == matrix.indices])
-    damped *= 4 / 3 / _spectral_radius(matrix, damped)
+    damped *= DAMPING / _spectral_radius(matrix, damped)
     rigid = bsr_matrix((blocks, aggregate, np.arange(n + 1)), shape=(n * size, count * size))
     prolong = _as_blocks(matrix @ rigid, size)
     owner = np.repeat(np.arange(n, dtype=np.int32), np.diff(prolong.indptr))
@@ -211,7 +217,7 @@ def _galerkin(matrix: bsr_matrix, prolong: bsr_matrix, restrict: bsr_matrix) -> 
 
 
 def _rows(matrix: bsr_matrix, begin: int) -> bsr_matrix:
-    """Some block rows of a matrix, its data shared."""
+    """At most `ROWS` block rows of a matrix, its data shared."""
     indptr = matrix.indptr[begin : begin + ROWS + 1]
     part, size = slice(indptr[0], indptr[-1]), matrix.blocksize[0]
     shape = ((len(indptr) - 1) * size, matrix.shape[1])

@@ -1,7 +1,8 @@
 """Poses in the world of known positions, such as satellite fixes: aligned to them, then bent to them along the path.
 
 Neither how far edges drift nor how far positions scatter is as their information states: both factors are estimated
-(solvers/bending.py), and a position that the others and the edges contradict is rejected.
+(solvers/bending.py), and a position that the others and the edges contradict is rejected. Poses are `world_from_cam`,
+lengths metres, distances of positions from what the others say sigmas.
 """
 
 from __future__ import annotations
@@ -9,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.chi2 import chi2_by_information
 from hodge_pipeline.complex.components import by_size, connected_components
-from hodge_pipeline.complex.judging import chi2_by_information
 from hodge_pipeline.solvers.bending import Bending, Bent
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.setup import NO_ROWS
@@ -49,7 +51,8 @@ NEAR_CERTAIN = 0.95
 @dataclass(frozen=True)
 class Fixes:
     """Known `points (P, 3)` of the world with their `covariances (P, 3, 3)`; each is `arms (P, 3)` in the axes of one
-    of the `vertices (P,)`. `stated (P,)`: whether its covariance is stated, not assumed.
+    of the `vertices (P,)`, an antenna's lever arm. `stated (P,)`: whether its covariance is stated, not assumed;
+    `labels (P,)` and `origin`: what a report calls each, and where they come from.
     """
 
     vertices: Ints
@@ -71,7 +74,7 @@ class Fixes:
         )  # fmt: skip
 
     def found(self, world_from_cam: Floats) -> Floats:
-        """Where (P, 3) poses put them."""
+        """Where (P, 3) poses (V, 4, 4) put them."""
         poses = world_from_cam[self.vertices]
         return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], self.arms) + poses[:, :3, 3])
 
@@ -85,6 +88,30 @@ class Placed:
     fit: PositionFit
 
 
+class _Aligned(NamedTuple):
+    """Poses (V, 4, 4) whose components were brought to their positions rigidly: which vertices (V,) were, which
+    positions (P,) agree with that, and why others were not.
+    """
+
+    world_from_cam: Floats
+    placed: Bools
+    used: Bools
+    problems: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Settled:
+    """Poses `world_from_cam (V, 4, 4)`, which positions are `used (P,)`, the `distance (P,)` of each from what all
+    others say, in sigmas, and the estimated factors on the sigmas of edges and of positions.
+    """
+
+    world_from_cam: Floats
+    used: Bools
+    distance: Floats
+    edge_factor: float
+    fix_factor: float
+
+
 def place(
     graph: ViewGraph, world_from_cam: Floats, component: Ints, weights: Floats, fixes: Fixes, up: Floats
 ) -> Placed:
@@ -94,16 +121,7 @@ def place(
     positions on a line. One with fewer than three positions, or with those of one place, stays where it is. Where there
     are so few that nothing tells how far edges drift, nothing more is done.
     """
-    poses, problems = world_from_cam.copy(), list[str]()
-    placed, used = np.zeros(len(poses), bool), np.zeros(len(fixes), bool)
-    for label in np.unique(component[fixes.vertices]):
-        rows, members = np.flatnonzero(component[fixes.vertices] == label), component == label
-        own = fixes.select(rows)
-        if problem := _cannot_place(own, poses):
-            problems.append(f"{counted(int(members.sum()), 'frame is|frames are')} not placed: {problem}")
-            continue
-        found, used[rows] = align_positions(own.found(poses), own.points, _sigma(own), up)
-        poses[members], placed[members] = found @ poses[members], True
+    poses, placed, used, problems = _aligned(world_from_cam, component, fixes, up)
     reached = placed[fixes.vertices]
     left = fixes.points - fixes.found(poses)
     settled = _Settled(poses, used, np.linalg.norm(_whitened(fixes, left), axis=1), 1.0, 1.0)
@@ -123,15 +141,32 @@ def place(
         settled.edge_factor,
         settled.fix_factor,
         fixes.origin,
-        tuple(problems),
+        problems,
     )
     return Placed(solved, by_size(np.where(placed, component.max(initial=0) + 1, component)), fit)
 
 
-def align_positions(found: Floats, known: Floats, sigma: Floats, up: Floats) -> tuple[Floats, Bools]:
-    """The motion (4, 4) that lays points (P, 3) on known ones, by least median of squares, and which (P,) it fits.
+def _aligned(world_from_cam: Floats, component: Ints, fixes: Fixes, up: Floats) -> _Aligned:
+    """Each component by the rigid motion that lays it on its positions, where these can place it."""
+    poses, problems = world_from_cam.copy(), list[str]()
+    placed, used = np.zeros(len(poses), bool), np.zeros(len(fixes), bool)
+    for label in np.unique(component[fixes.vertices]):
+        rows, members = np.flatnonzero(component[fixes.vertices] == label), component == label
+        own = fixes.select(rows)
+        if problem := _cannot_place(own, poses):
+            problems.append(f"{counted(int(members.sum()), 'frame is|frames are')} not placed: {problem}")
+            continue
+        motion, used[rows] = align_positions(own.found(poses), own.points, _sigma(own), up)
+        poses[members], placed[members] = motion @ poses[members], True
+    return _Aligned(poses, placed, used, tuple(problems))
 
-    `up (3,)` is what points up among the found ones: it settles what points on a line leave open.
+
+def align_positions(found: Floats, known: Floats, sigma: Floats, up: Floats) -> tuple[Floats, Bools]:
+    """The motion (4, 4) that lays found points (P, 3) on known ones, by least median of squares (Rousseeuw 1984) with
+    three refits to the inliers; and which points (P,) these are.
+
+    `sigma (P,)` of each, metres; `up (3,)` is what points up among the found ones: it settles what points on a line
+    leave open. The trials are seeded: the same points give the same motion.
     """
     rng = np.random.default_rng(0)
     count = len(found)
@@ -150,18 +185,21 @@ def align_positions(found: Floats, known: Floats, sigma: Floats, up: Floats) -> 
 
 
 def _motion(found: Floats, known: Floats, tie_m2: float, up: Floats) -> Floats:
-    """The least-squares motion (Arun 1987); where positions are within the noise, up stays up."""
+    """The least-squares motion (4, 4) from found points to known ones (Arun 1987). `tie_m2`, the variance of a point,
+    weighs that up stays up: it decides where positions differ across their line by their noise alone.
+    """
     moment = (known - known.mean(axis=0)).T @ (found - found.mean(axis=0)) / len(found)
     rotation = se3.project_to_so3(moment + tie_m2 * np.outer([0.0, 0.0, 1.0], up))
     return se3.from_parts(rotation, known.mean(axis=0) - rotation @ found.mean(axis=0))
 
 
 def _sigma(fixes: Fixes) -> Floats:
-    """The sigma (P,) of each, as of one axis."""
+    """The sigma (P,) of one axis, the root mean square of the three, metres."""
     return np.asarray(np.sqrt(np.trace(fixes.covariances, axis1=1, axis2=2) / 3))
 
 
 def _cannot_place(fixes: Fixes, poses: Floats) -> str:
+    """Why these positions of one component cannot place it; empty where they can."""
     if len(fixes) < FEWEST:
         return f"{len(fixes)} known positions among them, {FEWEST} are needed"
     spread_m = min(_extent_m(fixes.points), _extent_m(fixes.found(poses)))
@@ -172,21 +210,10 @@ def _cannot_place(fixes: Fixes, poses: Floats) -> str:
 
 
 def _extent_m(points: Floats) -> float:
-    """How far half of the points spread along their main axis."""
+    """How far nine in ten of the points (P, 3) spread along their main axis, metres."""
     middle = points - np.median(points, axis=0)
     axis = np.linalg.svd(middle, full_matrices=False)[2][0]
     return float(np.ptp(np.quantile(middle @ axis, [0.05, 0.95])))
-
-
-@dataclass(frozen=True)
-class _Settled:
-    """Poses, which positions are used, their distances, and the factors."""
-
-    world_from_cam: Floats
-    used: Bools
-    distance: Floats
-    edge_factor: float
-    fix_factor: float
 
 
 def _untorn(
@@ -230,13 +257,16 @@ def _encloses(vertices: Ints, others: Bools, stretch: Bools) -> bool:
 
 
 def _torn(graph: ViewGraph, poses: Floats) -> Floats:
-    """Chi-squared (E,) of each edge over the median; 0 of an edge without weight."""
+    """χ² (E,) of each edge over their median; 0 of an edge without weight."""
     chi2 = chi2_by_information(graph, poses)
     return np.asarray(chi2 / max(float(np.median(chi2[graph.information.any(axis=(1, 2))])), 1e-12))
 
 
 def _settled(bending: Bending, fixes: Fixes, used: Bools, allowed: Bools, finest: bool) -> _Settled:
-    """The poses once the rejections among those `allowed (P,)` do not change any more; bent as finely as can be?"""
+    """The poses bent to the `used (P,)` positions, once those rejected among the `allowed (P,)` do not change any more.
+
+    `finest`: with the most nodes, whatever the evidence, so that a jump of positions shows in the edges at its ends.
+    """
     least = 1.0 if fixes.stated.all() else LEAST_FACTOR
     for _ in range(MOST_ROUNDS):
         own = fixes.select(used)
@@ -250,11 +280,14 @@ def _settled(bending: Bending, fixes: Fixes, used: Bools, allowed: Bools, finest
 
 
 def _whitened(fixes: Fixes, vectors: Floats) -> Floats:
+    """Vectors (P, 3) in units of the fixes' own sigmas."""
     return np.asarray(np.einsum("nij,nj->ni", np.linalg.inv(np.linalg.cholesky(fixes.covariances)), vectors))
 
 
 def _distance(bent: Bent, fixes: Fixes, used: Bools) -> Floats:
-    """How far each position (P,) is from what all others say, in sigmas."""
+    """How far each position (P,) is from what all others say, in sigmas: what a used one contributes to its own pose is
+    taken out along each axis of the pose's variance (leave-one-out, to first order).
+    """
     found = fixes.found(bent.poses)
     half = np.linalg.inv(np.linalg.cholesky(fixes.covariances * bent.point_factor**2))
     known = half @ bent.covariances(fixes.vertices, found) @ np.swapaxes(half, 1, 2)

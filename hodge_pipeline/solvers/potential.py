@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import TypeAlias
 
 import numpy as np
@@ -12,28 +12,25 @@ from scipy.sparse import csr_matrix
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.coboundary import grounded_laplacian
-from hodge_pipeline.complex.cycles import (
-    adjusted_edges,
-    fundamental_products,
-    loop_deviation,
-    spanning_forest,
-)
+from hodge_pipeline.complex.cycles import adjusted_edges, fundamental_products, loop_deviation, spanning_forest
 from hodge_pipeline.complex.one_form import Logarithm, residual_form, shifted
 from hodge_pipeline.solvers.linear import factorise
 from hodge_pipeline.solvers.problem import pinned_vertices
-from hodge_pipeline.types import Floats, Ints, SolverIteration
+from hodge_pipeline.types import Bools, Floats, Ints, SolverIteration
 from hodge_pipeline.types.text import counted
 
-STILL_MOVING = 1e-4  # a step of 0.1 mm or 0.1 mrad is worth another iteration
+STILL_MOVING = 1e-4
+"""RMS of f: a step of 0.1 mm or 0.1 mrad is worth another iteration."""
 AroundLoops: TypeAlias = Callable[[Floats], Floats]
 """The motions (L, 4, 4) around the loops of one cycle basis, from the motions (E, 4, 4) of the edges."""
 
 
 @dataclass(frozen=True)
 class CentredProblem:
-    """The edges that can be used, and the start poses around the centroid of their component.
+    """The `edges (E, 2)` that can be used, and the `start (V, 4, 4)` poses around the centroid of their component.
 
     Far from the world's origin a little rotation would be much translation, and ω would depend on where the origin is.
+    `offset (V, 3)`: the centroid of each pose's component; `fixed`: rows of the vertices that stay.
     """
 
     edges: Ints
@@ -44,6 +41,11 @@ class CentredProblem:
     offset: Floats
     start_in_world: Floats
 
+    @cached_property
+    def held(self) -> Bools:
+        """Vertices (V,) that end where they start: the fixed ones, and the first of each component without any."""
+        return pinned_vertices(self.component, self.fixed)
+
     def form(self, poses: Floats, log: Logarithm) -> Floats:
         """ω (E, 6) at these poses."""
         return residual_form(self.edges, self.i_from_j, poses, log)
@@ -51,8 +53,7 @@ class CentredProblem:
     def in_world(self, poses: Floats) -> Floats:
         """The poses away from the centroid again; held vertices are those of the start to the last bit."""
         out = shifted(poses, self.offset)
-        held = pinned_vertices(self.component, self.fixed)
-        out[held] = self.start_in_world[held]
+        out[self.held] = self.start_in_world[self.held]
         return out
 
     def moved(self, poses: Floats, correction: Floats, log: Logarithm) -> Floats:
@@ -65,8 +66,7 @@ class CentredProblem:
         body = np.asarray(self.start[first] @ se3.inverse(out[first]))
         body[self.component[self.fixed]] = np.eye(4)
         out = np.asarray(body[self.component] @ out)
-        held = pinned_vertices(self.component, self.fixed)
-        out[held] = self.start[held]
+        out[self.held] = self.start[self.held]
         return out
 
     def poisson(self, d0: csr_matrix, weights: Floats) -> Callable[[Floats], Floats]:
@@ -75,15 +75,14 @@ class CentredProblem:
         f is 0 at the fixed vertices, and of mean zero on each component that has none. The Laplacian is factorised
         once; six right-hand sides are solved at a time.
         """
-        held = pinned_vertices(self.component, self.fixed)
-        factor = factorise(grounded_laplacian(d0, weights, held))
+        factor = factorise(grounded_laplacian(d0, weights, self.held))
         count = np.bincount(self.component)[:, None].astype(float)
         count[self.component[self.fixed]] = np.inf
 
         def solve(omega: Floats) -> Floats:
             divergence = d0.T @ (weights[:, None] * omega)
             f = np.zeros_like(divergence)
-            f[~held] = factor.solve(divergence[~held])
+            f[~self.held] = factor.solve(divergence[~self.held])
             sums = np.stack([np.bincount(self.component, column) for column in f.T], axis=1)
             return np.asarray(f - (sums / count)[self.component])
 
@@ -127,11 +126,7 @@ def iterate(
         poses = problem.moved(poses, correction, log)
         omega = problem.form(poses, log)
         step = float(np.sqrt((correction**2).sum(axis=1).mean()))
-        metrics = {
-            "step_rms": step,
-            **deviation_metrics(deviation, "loop_deviation"),
-            **more(adjusted),
-        }
+        metrics = {"step_rms": step, **deviation_metrics(deviation, "loop_deviation"), **more(adjusted)}
         objective = float(0.5 * weights @ (omega**2).sum(axis=1))
         history.append(SolverIteration(problem.in_world(poses), objective, metrics))
         if step < tolerance:

@@ -12,6 +12,9 @@ from hodge_pipeline.complex.components import by_size
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, Ints, Priors, Solution, ViewGraph
 
+PER_EDGE = ("edges", "i_from_j", "information", "fitness", "rmse_m", "source", "correspondences")
+"""The columns of a graph with one row for each edge."""
+
 
 def with_world(graph: ViewGraph, priors: Priors, start: Floats | None, fixed: Ints | None) -> tuple[ViewGraph, Floats]:
     """The graph with the world as its last vertex, held at the identity, and start poses (V + 1, 4, 4).
@@ -47,9 +50,6 @@ def with_world(graph: ViewGraph, priors: Priors, start: Floats | None, fixed: In
     if start is not None:
         poses[:count] = start
     return whole, poses
-
-
-PER_EDGE = ("edges", "i_from_j", "information", "fitness", "rmse_m", "source", "correspondences")
 
 
 def _unused(graph: ViewGraph) -> object:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hodge_pipeline.complex.judging import chi2_by_information, student_weight
+from hodge_pipeline.complex.chi2 import chi2_by_information, student_weight
 from hodge_pipeline.solvers.weights import dimension_of
 from hodge_pipeline.types import Floats, Solution, ViewGraph
 
@@ -25,10 +25,10 @@ def reweighted(
 
     `solved` gives the solution of weights (E,) from poses (V, 4, 4); `registered`: see `student_weight`.
     """
-    used, size = weights > 0, 3 if dimension_of(graph) == 2 else 6
+    used, axes = weights > 0, 3 if dimension_of(graph) == 2 else 6
     for _ in range(ROUNDS):
         chi2 = np.maximum(chi2_by_information(graph, solution.world_from_cam), 0.0)
-        new = np.where(used, student_weight(chi2, size, usual=chi2[used], registered=registered), 0.0)
+        new = np.where(used, student_weight(chi2, axes, usual=chi2[used], registered=registered), 0.0)
         if np.abs(new - weights).max(initial=0.0) < SETTLED:
             break
         weights, solution = new, solved(new, solution.world_from_cam)

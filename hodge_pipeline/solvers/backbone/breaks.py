@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.judging import FREEDOM, tail_weight
+from hodge_pipeline.complex.chi2 import FREEDOM, tail_weight
 from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis, student_log_density
 from hodge_pipeline.solvers.backbone.fit import Fit

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.chi2 import has_unit_information
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.cycles import spanning_forest
-from hodge_pipeline.complex.judging import has_unit_information
 from hodge_pipeline.solvers.backbone import plane
 from hodge_pipeline.solvers.weights import PLANAR_AXES
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph

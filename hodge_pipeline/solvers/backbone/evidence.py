@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln
 
-from hodge_pipeline.complex.judging import FREEDOM
+from hodge_pipeline.complex.chi2 import FREEDOM
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.linear import cholesky, motion_residuals
 from hodge_pipeline.types import Bools, Floats, Ints

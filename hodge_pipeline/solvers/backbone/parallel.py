@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.judging import has_unit_information, in_vertex_order, tail_gate
+from hodge_pipeline.complex.chi2 import has_unit_information, in_vertex_order, tail_gate
 from hodge_pipeline.solvers.backbone.chain import free_axes
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis
 from hodge_pipeline.types import Bools, Ints, ViewGraph

@@ -9,15 +9,8 @@ from scipy.linalg import lu_factor, lu_solve
 from scipy.sparse import csc_matrix
 
 from hodge_pipeline.complex.components import connected_components, first_of_component
-from hodge_pipeline.solvers.elimination import (
-    BlockFactor,
-    Elimination,
-    Group,
-    Ordering,
-    eliminate_blocks,
-    plan_elimination,
-    side_by_side,
-)
+from hodge_pipeline.solvers.block_factor import BlockFactor, eliminate_blocks, side_by_side
+from hodge_pipeline.solvers.elimination import Elimination, Group, Ordering, plan_elimination
 from hodge_pipeline.types import Floats, Ints
 
 MOST_NEIGHBOURS, FEWEST_IN_ROUND, SMALLEST_CORE = 24, 6, 64

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.judging import (
+from hodge_pipeline.complex.chi2 import (
     EXACT,
     MEDIAN_CHI2,
     STUDENT_99,

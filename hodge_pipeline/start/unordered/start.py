@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.pairs.sift_similarity import global_descriptors, most_similar, vocabulary
+from hodge_pipeline.pairs.vlad import global_descriptors, most_similar, vocabulary
 from hodge_pipeline.registration.acceptance import CONTRADICTS
 from hodge_pipeline.registration.global_features import DescribedCloud, describe
 from hodge_pipeline.registration.global_landmarks import DescribedImage

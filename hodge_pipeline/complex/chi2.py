@@ -39,9 +39,9 @@ def chi2_by_information(graph: ViewGraph, world_from_cam: Floats) -> Floats:
     return np.asarray(np.einsum("ea,eab,eb->e", xi, graph.information, xi))
 
 
-def tail_weight(chi2: Floats | float, axes: int) -> Floats:
+def tail_weight(chi2: Floats | float, axes: int, freedom: float = FREEDOM) -> Floats:
     """The weight of Student's t for each χ² of `axes` dimensions: 1 at the expected χ², more below."""
-    return np.asarray((FREEDOM + axes) / (FREEDOM + np.asarray(chi2)))
+    return np.asarray((freedom + axes) / (freedom + np.asarray(chi2)))
 
 
 def tail_gate(axes: int, share: float) -> float:
@@ -62,7 +62,7 @@ def student_weight(chi2: Floats, axes: int, *, usual: Floats, registered: bool =
     scale = float(np.median(voting)) / MEDIAN_CHI2[axes] if len(voting) else 1.0
     scaled = chi2 / max(scale, np.finfo(float).tiny)
     freedom, gate = (REGISTERED_FREEDOM, np.inf) if registered else (FREEDOM, STUDENT_99[axes])
-    return np.where(scaled <= gate, np.minimum((freedom + axes) / (freedom + scaled), 1.0), 0.0)
+    return np.where(scaled <= gate, np.minimum(tail_weight(scaled, axes, freedom), 1.0), 0.0)
 
 
 def squares_at_both_ends(i_from_j: Floats, xi: Floats) -> tuple[Floats, Floats]:
@@ -73,7 +73,7 @@ def squares_at_both_ends(i_from_j: Floats, xi: Floats) -> tuple[Floats, Floats]:
 
 
 def _i_origin_in_j(i_from_j: Floats) -> Floats:
-    """Frame i's origin (E, 3) in j's axes: residuals of translation at i are taken there."""
+    """Frame i's origin (E, 3) in frame j: residuals of translation at i are taken there."""
     return np.asarray(-np.einsum("eji,ej->ei", i_from_j[:, :3, :3], i_from_j[:, :3, 3]))
 
 

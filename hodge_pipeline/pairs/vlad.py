@@ -1,4 +1,7 @@
-"""Which frames look alike: one global descriptor for each frame (VLAD), compared by one matrix product."""
+"""Which frames look alike: one global descriptor for each frame (VLAD, Jégou et al. 2010), compared by matrix products.
+
+Local descriptors may be any unit vectors (n, D): RootSIFT of images, or histograms of clouds.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,11 @@ from typing import Protocol
 
 import numpy as np
 
+from hodge_pipeline.pairs.candidates import NO_PAIRS, row_blocks
 from hodge_pipeline.types import Bools, Floats32, Ints
 
-SAMPLED_DESCRIPTORS = 20_000
-LLOYD_STEPS = 12
-BLOCK_ENTRIES = 4_000_000
+SAMPLED_DESCRIPTORS, LLOYD_STEPS = 20_000, 12
+"""Local descriptors of all frames, and steps of k-means, that a vocabulary is learnt by: limits on cost."""
 
 
 class LocalFeatures(Protocol):
@@ -39,17 +42,19 @@ def _sampled(descriptors: Floats32, count: int, rng: np.random.Generator) -> Flo
 
 
 def _nearest(points: Floats32, centres: Floats32) -> Ints:
+    """The nearest centre (n,) of each point (n, D)."""
     scores = points @ centres.T - 0.5 * (centres**2).sum(axis=1)
     return np.asarray(scores.argmax(axis=1), np.int64)
 
 
 def _sums(points: Floats32, chosen: Ints, words: int) -> tuple[Floats32, Floats32]:
+    """The sum (words, D) and the number (words,) of the points that chose each word."""
     member = (chosen[:, None] == np.arange(words)).astype(np.float32)
     return np.asarray(member.T @ points), member.sum(axis=0)
 
 
 def global_descriptors(features: LocalFeatures, rows: Ints, centres: Floats32) -> Floats32:
-    """Unit VLAD vectors (R, words · D) (Jégou et al. 2010); zero for a frame without features."""
+    """Unit VLAD vectors (R, words · D); zero for a frame without features."""
     out = np.zeros((len(rows), centres.size), np.float32)
     for place, row in enumerate(rows):
         points = features.descriptors(int(row))
@@ -69,10 +74,9 @@ def most_similar(vectors: Floats32, per_row: int, excluded_reach: int) -> Ints:
     count = len(vectors)
     window = max(1, excluded_reach)
     starts = np.arange(0, count, window)
-    found = [np.zeros((0, 2), np.int64)]
-    step = max(1, BLOCK_ENTRIES // max(1, count))
-    for first in range(0, count, step):
-        block = np.arange(first, min(first + step, count))
+    found = [NO_PAIRS]
+    for rows in row_blocks(count):
+        block = np.arange(rows.start, rows.stop)
         scores = vectors[block] @ vectors.T
         scores[_near(block, count, excluded_reach)] = -np.inf
         padded = np.full((len(block), len(starts) * window), -np.inf, np.float32)
