@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Any, Literal, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 from hodge_pipeline.scene import Scene
 from hodge_pipeline.types import (
@@ -32,6 +32,9 @@ from hodge_pipeline.types import (
     ViewGraph,
 )
 from hodge_pipeline.types.notes import Note
+
+Adjusted: TypeAlias = Literal["nothing", "points", "all"]
+"""What an adjustment moves: nothing, points alone, or points and bodies."""
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -322,7 +325,7 @@ class TrackedModel(Protocol):
     def standard_errors(self) -> Floats:
         """Standard errors (B, 2) of each body's rotation and position, radians and units."""
 
-    def held_out_errors(self, entries: Bools, adjusts: Literal["nothing", "points", "all"]) -> Floats:
+    def held_out_errors(self, entries: Bools, adjusts: Adjusted) -> Floats:
         """Errors (H,) in pixels of the observations chosen from the N of `quality`, after an adjustment without them of
         nothing, of the points, or of bodies too; those that their points cannot spare are left out.
         """

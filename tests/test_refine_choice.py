@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.refine.candidates import Candidate, Found
+from hodge_pipeline.refine.candidates import CandidateModel, CandidateSet
 from hodge_pipeline.refine.choice import Choice, choose, refused_doubt
 from hodge_pipeline.refine.judge import costs
 from hodge_pipeline.refine.model import _loose_doubt, _metric_poses
@@ -52,7 +52,7 @@ class Model:
         return [np.full(20, self.ratio) for _ in range(10)]
 
 
-def found(before_px: float, after_px: float, points: int = 40, ratio: float = 1.0, sigma: float = 0.01) -> Found:
+def found(before_px: float, after_px: float, points: int = 40, ratio: float = 1.0, sigma: float = 0.01) -> CandidateSet:
     """The input and its bundle adjustment: 400 observations in ten images, of so many points."""
     parts = [
         replace(quality(flat(px, images=10, count=40)), points=points, mean_track_length=400 / points)
@@ -61,9 +61,9 @@ def found(before_px: float, after_px: float, points: int = 40, ratio: float = 1.
     models = [Model(parts[0]), Model(parts[1], moved=0.9, ratio=ratio, sigmas=(sigma,) * 10)]
     inputs, *costly = costs(parts[:1], parts)
     held_out = SimpleNamespace(held_out=np.zeros((8, 2), np.int64))
-    candidates: Any = [Candidate(name, model) for name, model in zip(("as given", "bundle"), models, strict=True)]
+    candidates: Any = [CandidateModel(name, model) for name, model in zip(("as given", "bundle"), models, strict=True)]
     depth: Any = held_out
-    return Found(inputs, candidates, costly, None, depth, ())
+    return CandidateSet(inputs, candidates, costly, None, depth, ())
 
 
 def apart(before_m: float, after_m: float) -> Floats:

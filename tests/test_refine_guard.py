@@ -9,14 +9,14 @@ from typer.testing import CliRunner
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.refine import verdict
-from hodge_pipeline.refine.guard import Change, Measure, decide
+from hodge_pipeline.refine.guard import Measure, PoseChange, decide
 from hodge_pipeline.refine.verdict import chi2_measure, first_as_good, spread_corrections
 from hodge_pipeline.scene import KeyFrames
 
 BETTER = Measure("held-out distance", 0.010, 0.009)
 WORSE = Measure("held-out score", 0.90, 0.88, better="higher")
-MOVED = Change(0.01, 0.5, 0.001, 0.05)
-STILL = Change(0.0005, 0.01, 0.001, 0.05)
+MOVED = PoseChange(0.01, 0.5, 0.001, 0.05)
+STILL = PoseChange(0.0005, 0.01, 0.001, 0.05)
 
 
 def test_a_better_result_is_kept():
@@ -112,7 +112,7 @@ def test_chi2_may_grow_by_a_fiftieth():
 
 
 def test_an_uncertainty_that_is_unknown_never_calls_a_change_insignificant():
-    assert Change(1e-9, 1e-9, math.nan, math.nan).is_significant
+    assert PoseChange(1e-9, 1e-9, math.nan, math.nan).is_significant
 
 
 def test_the_help_sends_a_graph_file_to_solve():
@@ -121,5 +121,5 @@ def test_the_help_sends_a_graph_file_to_solve():
 
 
 def test_a_change_is_told_in_millimetres_and_degrees():
-    told = str(Change(0.0125, 0.25, 0.004, 0.5))
+    told = str(PoseChange(0.0125, 0.25, 0.004, 0.5))
     assert told == "poses moved by 12.5 mm and 0.25° (RMS), known to 4 mm and 0.5°"

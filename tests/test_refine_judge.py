@@ -27,7 +27,9 @@ def quality(errors_px: Errors, *, parallax_deg: float = 10.0, length: int = 6) -
     keypoints = np.array([(names.index(name), column) for name, column in errors_px])
     values = np.array(list(errors_px.values()))
     parallaxes, lengths = np.full(len(values), parallax_deg), np.full(len(values), length)
-    return ModelQuality(len(names), 1, 1.0, names, keypoints, values, parallaxes, lengths)
+    return ModelQuality(
+        len(names), 1, 1.0, names, keypoints, values, parallaxes, lengths, np.zeros(len(values), np.int64)
+    )
 
 
 def flat(error_px: float, *, images: int = 2, count: int = 100) -> Errors:

@@ -357,14 +357,14 @@ def test_a_body_too_large_is_not_read(client: Client) -> None:
 
 
 def test_a_run_that_is_running_can_only_be_looked_at(session: Session, tmp_path: Path) -> None:
-    from hodge_pipeline.review.decisions import Decisions, Said
+    from hodge_pipeline.review.decisions import Decisions, LogEntry
     from hodge_pipeline.store.workspace import holding
 
     decisions = Decisions(tmp_path / "edits.json", tmp_path / "log.csv", run_folder=tmp_path)
     with holding(tmp_path):
         assert "another run uses this folder" in decisions.why_locked()
         with pytest.raises(LockedError, match="can only be looked at"):
-            decisions.add(0, Edit(disable=("1-2",)), Said())
+            decisions.add(0, Edit(disable=("1-2",)), LogEntry())
     assert decisions.why_locked() == "" and not (tmp_path / "edits.json").exists()
     locked = replace(session.subject, locked="the run is not finished")
     looking = Session(locked)

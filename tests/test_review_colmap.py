@@ -14,7 +14,7 @@ from hodge_pipeline.pairs.edits import read_history_file
 from hodge_pipeline.review.keeping import save
 from hodge_pipeline.review.listing import Query, describe, list_edges, state
 from hodge_pipeline.review.opening import Review
-from hodge_pipeline.review.routes import Pictures
+from hodge_pipeline.review.routes import EdgePictures
 from hodge_pipeline.review.subject import open_for_review
 from hodge_pipeline.types import Floats
 from test_readers_colmap_rigs import write_model
@@ -71,7 +71,7 @@ def test_decisions_are_kept_and_the_adjusted_model_is_written_beside_it(tmp_path
         session.wait()
         assert (session.settled.weights[session.rows_of(pair)] == 0).all()
         said = [str(list_edges(session, Query())), str(describe(session, 5))]
-        said += [one.caption for one in Pictures(session).of(5)]
+        said += [one.caption for one in EdgePictures(session).of(5)]
         assert "units" in said[0] and not [text for text in said if re.search(r"\d [cm]?m\b", text)]
         assert state(session)["finish"] == "adjust and save as COLMAP model" and describe(session, 3)["name"] == pair
         path, told = save(session)

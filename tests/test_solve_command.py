@@ -14,7 +14,7 @@ from hodge_adapters.pose_graphs.g2o import load_g2o, write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import CheckError, GraphError, HodgeError, RecipeError, SourceError
-from hodge_pipeline.refine.pose_graph import UNTOLD, Choices, disabled_edges, solve_file
+from hodge_pipeline.refine.pose_graph import UNTOLD, SolveOptions, disabled_edges, solve_file
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.types import ViewGraph
 from tests.backbone_graphs import drive
@@ -153,12 +153,12 @@ def test_mistakes_are_one_line(tmp_path, arguments, kind, message):
 def test_a_source_without_a_graph_or_poses_is_refused(tmp_path):
     (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
     with pytest.raises(SourceError, match="no"):
-        solve_file(tmp_path / "poses.tum", Choices())
+        solve_file(tmp_path / "poses.tum", SolveOptions())
     graph = graph_file(tmp_path / "in.g2o")
     write_g2o(tmp_path / "edges.g2o", graph)
     with pytest.raises(SourceError, match="--start chordal"):
-        solve_file(tmp_path / "edges.g2o", Choices(initial="given"))
-    solved = solve_file(tmp_path / "edges.g2o", Choices())
+        solve_file(tmp_path / "edges.g2o", SolveOptions(initial="given"))
+    solved = solve_file(tmp_path / "edges.g2o", SolveOptions())
     assert "cost_before" in solved.summary()
     assert any("fixed vertices have no pose" in note for note in solved.summary()["notes"])
 
@@ -221,7 +221,7 @@ def test_an_odometry_that_states_nothing_of_some_axes_is_told(tmp_path: Path) ->
     step = "EDGE_SE2 {} {} 1 0 0.01 1000 0 0 1000 0 0.001"
     lines = [step.format(k, k + 1) for k in range(9)] + ["EDGE_SE2 0 9 9 0.1 0 1000 0 0 1000 0 1000"]
     (tmp_path / "robot.g2o").write_text("\n".join(lines))
-    assert UNTOLD in solve_file(tmp_path / "robot.g2o", Choices()).solution.notes
-    assert UNTOLD not in solve_file(tmp_path / "robot.g2o", Choices(robust=True)).solution.notes
+    assert UNTOLD in solve_file(tmp_path / "robot.g2o", SolveOptions()).solution.notes
+    assert UNTOLD not in solve_file(tmp_path / "robot.g2o", SolveOptions(robust=True)).solution.notes
     (tmp_path / "robot.g2o").write_text("\n".join(lines).replace("0.001", "1000"))
-    assert UNTOLD not in solve_file(tmp_path / "robot.g2o", Choices()).solution.notes
+    assert UNTOLD not in solve_file(tmp_path / "robot.g2o", SolveOptions()).solution.notes

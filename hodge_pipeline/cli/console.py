@@ -1,4 +1,4 @@
-"""What a run looks like in the terminal: bars while it works, plain and quiet where nobody looks."""
+"""The terminal: progress bars while a run works, plain lines where none can be drawn, tables and JSON."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from hodge_pipeline.types.notes import Note, Rank
 from hodge_pipeline.types.text import visible, with_symbols
 
 WAITED_FOR_S = 1.0
-"""A stage that is over sooner is not worth a line."""
+"""Seconds below which a stage gets no line."""
 
 
 class ProgressBars:
@@ -66,7 +66,7 @@ class ProgressBars:
 
     @classmethod
     def of(cls, shown: Shown) -> ProgressBars:
-        """As a command shows what it does: JSON stands alone."""
+        """The bars of a command by its options: none where it prints JSON."""
         return cls(shown.quiet or shown.as_json, shown.verbose)
 
     def __enter__(self) -> ProgressBars:
@@ -85,9 +85,7 @@ class ProgressBars:
 
     @contextmanager
     def _line(self, title: str, total: int) -> Iterator[Advance]:
-        """Say once that the stage is done: how much it was, and how long it took; of recording, which comes in parts,
-        at the end.
-        """
+        """One line when the stage is done, with amount and time; recording comes in parts, and gets its line last."""
         start = time.perf_counter()
         yield no_progress
         seconds = time.perf_counter() - start
@@ -113,7 +111,7 @@ class ProgressBars:
         self._progress.update(task, completed=before + total)
 
     def note(self, note: Note) -> None:
-        """Its sentence, at once where it asks for a look."""
+        """Print the note's sentence, of a mere fact only where `verbose`."""
         if self._verbose or note.rank < Rank.FACT:
             self.say(str(note))
 
@@ -123,7 +121,7 @@ class ProgressBars:
 
 
 class RateColumn(ProgressColumn):
-    """Units a second, nothing where a stage has one unit alone."""
+    """Units a second; nothing of a stage with a single unit."""
 
     def render(self, task: Task) -> Text:
         """The rate while it runs, of the whole once it is done."""

@@ -1,4 +1,4 @@
-"""`hodge convert`: what one reader opens, written by a writer."""
+"""`hodge convert`: open a path by a reader, write it by a writer."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def convert(
 
 
 def writer_name(out: Path, source: Source) -> str:
-    """The writer that an output's name means; `.json` is Open3D's, of the graph where there is one."""
+    """The writer by an output's name; `.json` is Open3D's pose graph or trajectory. Raises `RecipeError` for others."""
     known = registry.names("writers")
     if out.name in BY_NAME:
         return BY_NAME[out.name]

@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from hodge_pipeline.uses.diagnosed import Diagnosed
 
 SUGGESTED = 3
+"""Pairs to register that `--verbose` names."""
 LEAST_SHOWN, MOST_BAD = 3, 20
-"""Rows of the whole table where nobody says how many: the edges that are not consistent, and a few in any case."""
+"""Rows of the table without `--top`: the edges that are not consistent, at least and at most so many."""
 HEADER = ("edge", "verdict", "right", "why", "what to do")
 
 
@@ -67,7 +68,7 @@ def _to_register(found: Diagnosed) -> list[str]:
 
 
 def _lines(found: Diagnosed, out: Path | None, top: int | None, bad: int) -> list[str]:
-    """The verdict, the worst edges, what to heed and what to type next: ten lines, or `top` edges."""
+    """The verdict, the worst edges, a note and what to type next, in ten lines, or with `top` edges."""
     head = labelled("verdict", found.sentence)
     worrying = [note for note in found.notes if note not in found.diagnosis.notes]
     tail = [line for note in worrying[:1] for line in at_most(labelled("look", note), 3)]

@@ -31,7 +31,7 @@ from hodge_pipeline.types.text import command, with_symbols
 
 @dataclass(frozen=True)
 class Pairs:
-    """The pairs to disable, enable, register and hold for right, as they were typed."""
+    """The pairs to disable, enable, register and mark right, as they were typed."""
 
     disable: Sequence[str]
     enable: Sequence[str]
@@ -43,7 +43,7 @@ class Pairs:
 
 
 def edit(folder: Path, pairs: Pairs, shown: Shown, *, undo: bool, listing: bool) -> None:
-    """Add to the history of edits, or take the last back, and print what the edits now come to."""
+    """Add to the history of edits, or undo the last, and print the edits that are in force."""
     if undo and pairs:
         raise GraphError("--undo takes the last edit back: give it alone")
     listed = listed_edges(folder)
@@ -95,7 +95,7 @@ def _verdicts_spelt_out(listed: Listed, words: Sequence[str]) -> list[str]:
 
 
 def _words(pairs: Sequence[str]) -> list[str]:
-    """The pairs, those of `12-87,3-40` apart."""
+    """The pairs one by one, those of `12-87,3-40` split."""
     return [word.strip() for pair in pairs for word in pair.split(",") if word.strip()]
 
 
@@ -114,6 +114,7 @@ def _print(folder: Path, history: History, listed: Listed, *, changed: bool, lis
 
 
 def _facts(edges: Edges, row: int | None, switch: str) -> str:
+    """What is known of an edge, in brackets; None: a pair without one."""
     if row is None:
         return "  (no edge yet)" if switch == REGISTERED else "  (not an edge of the last round)"
     probability = float(edges.probability[row])

@@ -6,7 +6,7 @@ import sys
 
 
 def main() -> None:
-    """Run the command; stopped before it has begun, it ends with 130 and without a word, as later."""
+    """Run the command; Ctrl-C during its imports ends it with 130 and no traceback."""
     try:
         from hodge_pipeline.store.memory import keep_memory
 

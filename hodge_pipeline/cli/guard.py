@@ -1,4 +1,4 @@
-"""What is printed is shown: names that strangers wrote move no cursor, colour nothing and hide nothing."""
+"""Streams that escape control characters: names of unknown origin must not move the cursor, colour or hide text."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 from typing import Any, TextIO
 
 LONGEST_ERROR = 1000
-"""Characters: longer ones quote a name or a value that no person wrote."""
+"""Characters: longer errors quote a name or a value that no person wrote."""
 
 
 class Guarded:
@@ -24,17 +24,17 @@ class Guarded:
 
 
 def guard_streams() -> None:
-    """Let what is printed from now on be shown; what draws colours and bars takes the `unguarded` stream."""
+    """Guard stdout and stderr from now on; what draws colours and bars takes the `unguarded` stream."""
     sys.stdout, sys.stderr = Guarded(sys.stdout), Guarded(sys.stderr)
 
 
 def unguarded(stream: TextIO) -> TextIO:
-    """The stream for what moves the cursor by right, and shows its own texts."""
+    """The stream itself, for code that draws and escapes texts by itself."""
     return stream.stream if isinstance(stream, Guarded) else stream
 
 
 def shown_error(error: object) -> str:
-    """An error in one line that can be read: of what it quotes at length the beginning and the end."""
+    """An error in one line; of a long one the beginning and the end."""
     from hodge_pipeline.types.text import with_symbols
 
     text = with_symbols(str(error))
@@ -43,7 +43,7 @@ def shown_error(error: object) -> str:
 
 
 def shown(text: str, *, lines: bool = False) -> str:
-    """The text as `visible` has it, which is imported where it is needed alone: most commands print plain words."""
+    """The text as `visible` escapes it, whose import is avoided for plain text: most commands print nothing else."""
     if text.replace("\n", "").isprintable() and (lines or "\n" not in text):
         return text
     from hodge_pipeline.types.text import visible

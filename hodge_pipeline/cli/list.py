@@ -31,7 +31,7 @@ def inspect(path: Path, *, reader: str | None, settings: Sequence[str], as_json:
 
 
 def next_command(path: Path, facts: dict[str, Any], reader: str | None, settings: Sequence[str] = ()) -> str:
-    """What to type next with such a path, opened with such `settings` of its reader."""
+    """The command to type next for a path with these `facts`, opened by this reader with these `settings`."""
     if not facts["frames"]:
         if facts.get("graph", {}).get("edges"):
             return command("hodge", "solve", path, "--out", "solved.g2o")
@@ -114,7 +114,7 @@ def recipes(name: str | None, *, schema: bool) -> None:
 
 
 def _kind(name: str | None) -> type:
-    """What a recipe describes: a run, which is what no name stands for, or the refinement of a model."""
+    """The type that a recipe binds to: `ModelRefinement` where it refines a model, else `Recipe`, as without a name."""
     from hodge_pipeline.recipe import recipe_file
     from hodge_pipeline.recipe.schema import Recipe
     from hodge_pipeline.refine.model_options import ModelRefinement

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from hodge_pipeline.refine.model import RefinedModel
 
 MEASURES, NOTES = 4, 1
-"""Of a model, where nobody asks for all."""
+"""Printed of a model without `--verbose`."""
 
 
 def refine(

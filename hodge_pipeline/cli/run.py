@@ -68,7 +68,7 @@ def print_result(result: Run, shown: Shown) -> None:
 
 @contextmanager
 def _viewer(live: bool, terminal: ProgressBars) -> Iterator[str | None]:
-    """The address of a viewer where one is wished for, and a line that says where it is seen."""
+    """The address of a live viewer, where one is asked for; a line says where it is seen."""
     if not live:
         yield None
         return
@@ -80,7 +80,7 @@ def _viewer(live: bool, terminal: ProgressBars) -> Iterator[str | None]:
 
 
 class Terminated(KeyboardInterrupt):
-    """The system asks the process to end, as Ctrl-C does."""
+    """SIGTERM: the system asks the process to end, as Ctrl-C does."""
 
 
 def _terminate(*_: object) -> None:
@@ -89,7 +89,7 @@ def _terminate(*_: object) -> None:
 
 @contextmanager
 def resumable(out: Path) -> Iterator[None]:
-    """Says in one line how a run that was stopped goes on, and exits: 130 after Ctrl-C, 143 after a TERM."""
+    """Exit with one line on how a stopped run goes on: code 130 after Ctrl-C, 143 after SIGTERM."""
     before = signal.signal(signal.SIGTERM, _terminate)
     try:
         yield

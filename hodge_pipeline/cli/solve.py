@@ -12,7 +12,7 @@ from hodge_pipeline.cli.options import Shown
 from hodge_pipeline.cli.paths import check_result, keep_source
 from hodge_pipeline.errors import CheckError, RecipeError
 from hodge_pipeline.pairs.edits import read_history
-from hodge_pipeline.refine.pose_graph import Choices, SolvedFile, solve_file, write_solved
+from hodge_pipeline.refine.pose_graph import SolvedFile, SolveOptions, solve_file, write_solved
 from hodge_pipeline.report.brief import LABEL, at_most, labelled
 from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName
@@ -23,11 +23,11 @@ from hodge_pipeline.types import Source
 from hodge_pipeline.types.text import command, counted
 
 COUNTED = ("pose", "edge", "piece")
+"""Counts of the summary that are printed."""
 KNOWN_ENDINGS = (".tum", ".kitti", ".csv", ".log", ".json", ".ply")
-"""Endings that say the format. `.txt` does not: many programs name their g2o files so."""
-
+"""Endings that tell the format. `.txt` does not: many programs name their g2o files so."""
 NOTES = 2
-"""In ten lines."""
+"""Printed without `--verbose`."""
 
 
 def choices(
@@ -40,8 +40,11 @@ def choices(
     trust: str | None,
     certificate: bool,
     sesync_units: bool,
-) -> Choices:
-    """The options as given, checked. Only the isotropic objective has a certificate, so asking for one implies it."""
+) -> SolveOptions:
+    """The checked options; a certificate implies the isotropic objective, which alone has one.
+
+    Raises `RecipeError` for options that are wrong or contradict each other.
+    """
     named = objective or ("isotropic" if certificate or sesync_units else "full")
     for option, value, known in (
         ("--objective", named, get_args(ObjectiveName)),
@@ -57,12 +60,12 @@ def choices(
         raise RecipeError(f"--time-limit {time_limit_s:g}: expected seconds above zero")
     initial: InitialName = "given" if start == "given" else "chordal"
     chosen: ObjectiveName = "isotropic" if named == "isotropic" else "full"
-    return Choices(chosen, initial, robust, certificate, sesync_units, tuple(disable), trust or AUTO, time_limit_s)
+    return SolveOptions(chosen, initial, robust, certificate, sesync_units, tuple(disable), trust or AUTO, time_limit_s)
 
 
 def solve(
     path: Path,
-    options: Choices,
+    options: SolveOptions,
     shown: Shown,
     *,
     out: Path | None,
@@ -73,7 +76,7 @@ def solve(
 
     A run folder given alone is solved and fused again, with its edits, and brought up to date.
     """
-    if out is None and run_folder is None and options == Choices() and (path / RECIPE_FILE).is_file():
+    if out is None and run_folder is None and options == SolveOptions() and (path / RECIPE_FILE).is_file():
         _solve_run(path, shown, dask)
         return
     if path.is_dir() and (history := read_history(path)).edits:
@@ -102,7 +105,7 @@ def solve(
 
 
 def _writer(out: Path, source: Source) -> str:
-    """The writer of a result by its ending: those of poses, and Open3D's; any other name is that of a g2o file."""
+    """The writer of a result by its ending; any ending that tells no format is a g2o file's."""
     return writer_name(out, source) if out.suffix.lower() in KNOWN_ENDINGS else "g2o"
 
 

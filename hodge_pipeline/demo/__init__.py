@@ -1,1 +1,1 @@
-"""The demo: a furnished room modelled in code, rendered and written as a TUM sequence."""
+"""The demo's data: rooms rendered as TUM sequences, and a street scanned by a LiDAR, all modelled in code."""

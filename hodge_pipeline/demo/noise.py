@@ -1,4 +1,4 @@
-"""What a structured-light camera makes of ideal images.
+"""The errors of a structured-light camera, added to ideal images.
 
 The depth model is the one of ICL-NUIM (Handa et al., A Benchmark for RGB-D Visual Odometry, 3D Reconstruction and SLAM,
 ICRA 2014, after Barron and Malik): pixels are shifted at random, and depth is measured as a disparity in whole steps,
@@ -16,20 +16,26 @@ from hodge_pipeline.types import Bools, Bytes, Floats, Floats32
 DISPARITY_M = 351.3
 """Disparity steps times metres, for 640 pixels: one step is 2.8 mm at 1 m and 4.6 cm at 4 m."""
 WHITE_STEPS = 1 / 6
+"""Standard deviation of the disparity of single pixels, in steps."""
 SHARED_STEPS = 0.5
-"""1.3 cm at 3 m, with the steps 1.5 cm: what Khoshelham and Elberink measured (Sensors 12, 2012)."""
+"""Standard deviation of the error that neighbours share: 1.3 cm at 3 m, with rounding 1.5 cm, as Khoshelham and
+Elberink measured (Sensors 12, 2012)."""
 SHARED_SHARE_OF_WIDTH = 0.02
+"""Correlation length of that error, as a share of the image's width."""
 SHIFT_SHARE_OF_WIDTH = 0.5 / 640
+"""Standard deviation of the pixels' shift: half a pixel of 640 (Handa et al.)."""
 RANGE_M = (0.4, 4.5)
+"""Depth that is measured, about that of the first Kinect."""
 GRAZING_COS = 0.17
-EDGE_RATIO = 0.05
-EDGE_DROP = 0.7
+"""Cosine of incidence below which nothing is measured: 80 degrees."""
+EDGE_RATIO, EDGE_DROP = 0.05, 0.7
+"""Relative step of depth that is an edge, and the share of its pixels that are not measured."""
 
 
 def measured_depth(depth_m: Floats32, facing: Floats32, rng: np.random.Generator, scale: float) -> Floats32:
-    """The depth image (H, W) that the camera gives, metres, 0 where it gives none.
+    """The measured depth (H, W) of a true one, metres, 0 where there is none.
 
-    `facing (H, W)` is the cosine of incidence; `scale` multiplies every random error, and 0 leaves only the range.
+    `facing (H, W)` is the cosine of incidence; `scale` multiplies every random error; with 0 only the range is limited.
     """
     if scale == 0:
         return np.where(_in_range(depth_m), depth_m, np.float32(0))
@@ -47,7 +53,7 @@ def measured_depth(depth_m: Floats32, facing: Floats32, rng: np.random.Generator
 
 
 def photographed(image: Floats32, rng: np.random.Generator, scale: float) -> Bytes:
-    """The 8-bit RGB image of an ideal one in 0..1: darker towards the corners, grainy."""
+    """The 8-bit RGB image (H, W, 3) of an ideal one in 0..1: with vignetting and grain, both times `scale`."""
     height, width = image.shape[:2]
     row, column = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     vignette = 1 - 0.1 * scale * (row**2 + column**2)

@@ -1,4 +1,4 @@
-"""A part is one body with one material; furniture is a list of parts in its own frame."""
+"""Parts: bodies with a material each. A piece of furniture is a list of parts in its own frame; metres."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Part:
 
 
 def motion(x: float, y: float, z: float = 0.0, yaw_deg: float = 0.0, roll_deg: float = 0.0) -> Floats:
-    """The motion (4, 4) that rolls about x, then turns about z, then shifts."""
+    """The motion (4, 4) that rolls about x, then turns about z, then shifts; degrees and metres."""
     yaw = se3.so3_exp(np.array([0, 0, np.radians(yaw_deg)]))
     roll = se3.so3_exp(np.array([np.radians(roll_deg), 0, 0]))
     return se3.from_parts(yaw @ roll, np.array([x, y, z]))
@@ -61,6 +61,6 @@ def part(
 
 
 def placed(parts: Iterable[Part], x: float, y: float, z: float = 0.0, yaw_deg: float = 0.0) -> list[Part]:
-    """The parts, moved together."""
+    """The parts of a piece of furniture, moved together."""
     room_from_furniture = motion(x, y, z, yaw_deg)
     return [replace(p, room_from_part=room_from_furniture @ p.room_from_part) for p in parts]

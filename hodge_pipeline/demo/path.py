@@ -1,4 +1,4 @@
-"""The paths of a camera carried by hand: round the middle of the room, and through a building and back."""
+"""Paths of a hand-held camera: round the middle of a room, and through a building and back."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ from hodge_pipeline.demo.room import room_origin
 from hodge_pipeline.types import Floats
 
 TREMOR_HZ = (0.6, 3.0)
+"""Frequencies of the hand's shaking."""
 TREMOR_TERMS = 6
+"""Sines that each of its six components adds up."""
 LAST_ROOM = 7
-"""Waypoints in the last room of a walk; the others have four on each way."""
+"""Waypoints in the last room of a walk; in the other rooms there are four on the way there and four back."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class HandHeldLoop:
         return np.asarray(steady @ se3.exp(_tremor(self.seed, times_s, self.tremor_m, self.tremor_deg)))
 
     def _steady(self, angle: Floats) -> Floats:
-        """The path without tremor: the camera opposite to where it looks, so that it sees the room's width."""
+        """Poses (N, 4, 4) without tremor: the camera looks across the middle, so that it sees the room's width."""
         radius = self.radius_m * (1 + 0.12 * np.cos(2 * angle))
         height = self.height_m + 0.1 * np.sin(2 * angle + 0.7)
         position = np.stack([-radius * np.cos(angle), -radius * np.sin(angle), height], axis=-1)
@@ -68,18 +70,18 @@ class Walk:
 
     @property
     def duration_s(self) -> float:
-        """How long it takes."""
+        """Seconds that the walk takes."""
         return float(self._way.x[-1]) / self.speed_m_s
 
     @cached_property
     def _way(self) -> CubicSpline:
-        """The place (2,) on the floor after a way in metres."""
+        """The place (2,) on the floor by the way walked, metres."""
         places = np.array(_waypoints(self.rooms))
         lengths = np.linalg.norm(np.diff(places, axis=0), axis=1)
         return CubicSpline(np.concatenate([[0.0], np.cumsum(lengths)]), places)
 
     def world_from_cam(self, times_s: Floats) -> Floats:
-        """Poses (N, 4, 4) at the times (N,); before its beginning and after its end the camera stands."""
+        """Poses (N, 4, 4) at the times (N,); before and after the walk the camera stands still."""
         times_s = np.asarray(times_s, float)
         way = np.clip(times_s, 0, self.duration_s) * self.speed_m_s
         place, height = self._way(way), 1.45 + 0.08 * np.sin(way / 1.7)
@@ -89,12 +91,12 @@ class Walk:
         return np.asarray(steady @ se3.exp(_tremor(self.seed, times_s, 0.004, 0.3)))
 
     def _heading(self, way: Floats) -> Floats:
-        """Where (N,) the camera looks, radians: where the way leads, and all round in each room."""
+        """The camera's heading (N,), radians, after a way (N,): ahead, and once all round in each room."""
         return np.asarray(np.interp(way, *self._headings))
 
     @cached_property
     def _headings(self) -> tuple[Floats, Floats]:
-        """The heading at places along the way: the mean over a metre, so that nobody turns on the spot."""
+        """The way (W,) and the heading there (W,), smoothed over about a metre so that nobody turns on the spot."""
         grid = np.linspace(0, float(self._way.x[-1]), max(2, int(20 * self._way.x[-1])))
         ahead = self._way(grid, 1)
         angle = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])) + np.interp(grid, self._way.x, self._rounds)
@@ -102,7 +104,7 @@ class Walk:
 
     @property
     def _rounds(self) -> Floats:
-        """How far (W,) the camera has turned round at each waypoint, radians, besides the turns of the way."""
+        """How far (W,) the camera has turned at each waypoint beyond the turns of the way, radians."""
         passed = 4 * (self.rooms - 1)
         turned = np.zeros(2 * passed + LAST_ROOM)
         for first in (*range(1, passed, 4), *range(passed + LAST_ROOM, 2 * passed + LAST_ROOM, 4)):
@@ -112,7 +114,7 @@ class Walk:
 
 
 def _waypoints(rooms: int) -> list[Floats]:
-    """Places (2,) on the floor: through each room on its west side, and back on its east side."""
+    """Places (2,) on the floor: through each room on its west side, round the last, and back on the east side."""
     west = [(-0.2, -1.9), (-1.2, -0.7), (-0.9, 0.8), (0.5, 1.7)]
     east = [(1.1, 1.7), (1.7, 0.6), (1.0, -1.0), (0.0, -1.9)]
     turn = [(-0.2, -1.9), (-1.2, -0.7), (-0.8, 0.8), (0.3, 1.2), (1.3, 0.5), (1.0, -1.0), (0.0, -1.9)]
@@ -123,14 +125,14 @@ def _waypoints(rooms: int) -> list[Floats]:
 
 
 def _looking(position: Floats, yaw: Floats, pitch: Floats) -> Floats:
-    """Poses (N, 4, 4) at positions (N, 3) of a level camera that looks along yaw and pitch."""
+    """Poses (N, 4, 4) at positions (N, 3) of a camera without roll that looks along yaw and pitch (N,), radians."""
     forward = np.stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)], axis=-1)
     right = np.stack([np.sin(yaw), -np.cos(yaw), np.zeros_like(yaw)], axis=-1)
     return se3.from_parts(np.stack([right, np.cross(forward, right), forward], axis=-1), position)
 
 
 def _tremor(seed: int, times_s: Floats, tremor_m: float, tremor_deg: float) -> Floats:
-    """Twists (N, 6) of the hand: a sum of slow sines, so that 100 Hz samples interpolate to well below 1 mm."""
+    """Twists (N, 6) of the hand: sums of slow sines, so that 100 Hz samples interpolate to well below 1 mm."""
     rng = np.random.default_rng([seed, 1])
     hertz = rng.uniform(*TREMOR_HZ, (TREMOR_TERMS, 6))
     phase = rng.uniform(0, 2 * np.pi, (TREMOR_TERMS, 6))

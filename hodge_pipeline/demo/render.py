@@ -1,4 +1,4 @@
-"""Depth, colour and angle of incidence of the room as an ideal camera sees it, by ray casting."""
+"""Depth, colour and angle of incidence of a room as an ideal camera sees them, by ray casting."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from hodge_pipeline.types import Camera, Floats, Floats32, Ints
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 """open3d sends the ray of pixel (0, 0) through (0.5, 0.5); in `Camera` the centres of pixels are whole numbers."""
 SHADOW_GAP_M = 0.01
+"""From a surface to where its shadow ray starts, so that it does not shade itself."""
 AMBIENT, SKYLIGHT, LAMPLIGHT = 0.42, 0.16, 0.62
+"""Light from everywhere, from the window and from the lamp, as shares of a white surface's brightness."""
 BLUR_SAMPLES, EDGE = 7, cv2.BORDER_REPLICATE
-"""Along the way of a pixel while the shutter is open, which is a few pixels long."""
+"""Samples along the way of a pixel while the shutter is open, a few pixels long, and what lies beyond the image."""
 
 
 @dataclass(frozen=True)
 class Hits:
-    """What the rays of one image meet first, for the pixels that meet anything.
+    """What the rays of an image hit first, for the P pixels that hit anything.
 
     `pixel (P,)` flat pixel numbers; `depth_m (P,)` along the optical axis; `points_in_room (P, 3)`; unit
     `normals (P, 3)` towards the camera; `facing (P,)` the cosine between normal and ray; `part (P,)` rows of the room.
@@ -58,8 +60,9 @@ class Renderer:
         return depth_m, facing
 
     def colour(self, world_from_cam: Floats, moved: Floats | None = None) -> Floats32:
-        """The lit image (H, W, 3), RGB in 0..1; blurred where the camera has `moved` by a twist (6,) in its own axes
-        while the shutter was open.
+        """The lit image (H, W, 3), RGB in 0..1; blurred where a twist `moved (6,)` in the camera's axes is given.
+
+        The twist is the motion of the camera while its shutter is open.
         """
         hits = self._cast(world_from_cam)
         room, image = self.room, np.zeros((self.camera.height * self.camera.width, 3), np.float32)
@@ -70,7 +73,7 @@ class Renderer:
         return whole if moved is None else self._blurred(whole, hits, moved)
 
     def _blurred(self, image: Floats32, hits: Hits, moved: Floats) -> Floats32:
-        """The mean of the image along the way of each pixel."""
+        """The mean of the image along the way of each pixel, which the twist and the pixel's depth give."""
         camera, row, column = self.camera, *np.divmod(hits.pixel, self.camera.width)
         slope_x, slope_y = (column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
         slopes = np.stack([slope_x, slope_y, np.ones(len(row))], axis=1)
@@ -87,6 +90,7 @@ class Renderer:
         return np.asarray(np.mean(seen, axis=0), np.float32)
 
     def _cast(self, world_from_cam: Floats) -> Hits:
+        """The hits of an image at a pose (4, 4), or at a pose (H, 4, 4) of each row."""
         rays = self._rays(world_from_cam)
         found = self._scene.cast_rays(rays)
         depth_m = found["t_hit"].numpy().ravel()
@@ -116,14 +120,14 @@ class Renderer:
         return o3d.core.Tensor.from_numpy(np.concatenate([origins, directions], axis=2).astype(np.float32))
 
     def _normals(self, triangle: Ints, uv: Floats32) -> Floats:
-        """Unit normals (P, 3), interpolated between the corners so that round bodies look round."""
+        """Unit normals (P, 3), interpolated between a triangle's corners so that round bodies look round."""
         corners = self.room.normals[self.room.triangles[triangle]]
         shares = np.stack([1 - uv[:, 0] - uv[:, 1], uv[:, 0], uv[:, 1]], axis=1)
         normals = np.einsum("pc,pcd->pd", shares, corners)
         return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
 
     def _texture(self, hits: Hits) -> Floats32:
-        """Texture colours (P, 3): each part's own x, y or z face, whichever the surface faces most, carries it."""
+        """Texture colours (P, 3), projected along that axis of the part that the surface faces most."""
         part_from_room = self.room.part_from_room[hits.part]
         local = np.einsum("pij,pj->pi", part_from_room[:, :3, :3], hits.points_in_room) + part_from_room[:, :3, 3]
         faces = np.abs(np.einsum("pij,pj->pi", part_from_room[:, :3, :3], hits.normals)).argmax(axis=1)
@@ -136,7 +140,7 @@ class Renderer:
         return self.room.textures.sample(self.room.texture[hits.part], np.stack([u, v], axis=1), footprint)
 
     def _light(self, hits: Hits) -> Floats32:
-        """The light (P,) that falls on each point: ambient, from the sky, and from the lamp where nothing shades it."""
+        """The light (P,) on each point: ambient, skylight from the window, and lamplight, 15 % of it in shadow."""
         start = hits.points_in_room + SHADOW_GAP_M * hits.normals
         towards = self.room.lamp[hits.part] - start
         distance = np.linalg.norm(towards, axis=1)

@@ -1,4 +1,4 @@
-"""The room: x and y along the walls, z up, the origin in the middle of the floor; metres."""
+"""The demo's rooms: x and y along the walls, z up, the origin in the middle of the floor; metres."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from hodge_pipeline.demo.textures import Textures, make_textures
 from hodge_pipeline.types import Bools, Floats, Floats32, Ints
 
 WIDTH, DEPTH, HEIGHT = 5.6, 4.8, 2.6
+"""Of a room: along x, y and z."""
 LAMP: Triple = (0.3, -0.2, 1.85)
 DOOR_WIDTH, DOOR_HEIGHT = 0.9, 2.05
 NORTH_DOOR, SOUTH_DOOR = 0.8, 0.2
-"""How far along its wall a door is, in metres to the right as seen from inside."""
+"""Where a door is in its wall: metres to the right of its middle as seen from inside."""
 NORTH, WEST, SOUTH, EAST = 0.0, 90.0, 180.0, -90.0
 """The yaw, in degrees, that turns a piece's back to the wall at +y, -x, -y, +x."""
 
@@ -29,7 +30,7 @@ class Room:
     - `vertices (V, 3)`, `normals (V, 3)`, `triangles (T, 3)` in the room's frame; `part_of_triangle (T,)`.
     - for each part: `part_from_room (P, 4, 4)`, `texture (P,)` rows of `textures`, `tint (P, 3)`, `tile_m (P, 3)`,
       `glow (P,)`, `measurable (P,)`: see `Material`.
-    - `lamp (P, 3)`: where the light hangs that each part is lit by.
+    - `lamp (P, 3)`: the position of the light by which each part is lit.
     """
 
     vertices: Floats
@@ -47,7 +48,7 @@ class Room:
 
 
 def _shell(doorways: Mapping[float, float]) -> list[Part]:
-    """Floor, ceiling, walls and skirting; `doorways` are how far along the wall of a yaw one is, in metres."""
+    """Floor, ceiling, walls and skirting; `doorways` by the yaw of their wall, metres to the right of its middle."""
     wall = Material("plaster", (0.93, 0.89, 0.8), (2.2, 2.2, 2.2))
     accent = Material("plaster", (0.7, 0.8, 0.83), (1.9, 1.9, 1.9))
     floor = Material("boards", (1.0, 0.92, 0.85), (1.4, 1.4, 1.0))
@@ -71,7 +72,7 @@ def _shell(doorways: Mapping[float, float]) -> list[Part]:
 
 
 def _beside(half: float, doorway: float | None) -> list[tuple[float, float]]:
-    """From where to where a wall is closed."""
+    """The (left, right) ends of the closed pieces of a wall 2 `half` long."""
     if doorway is None:
         return [(-half, half)]
     return [(-half - 0.1, doorway - DOOR_WIDTH / 2), (doorway + DOOR_WIDTH / 2, half + 0.1)]
@@ -93,7 +94,7 @@ def _on_wall(parts: list[Part], yaw_deg: float, along: float, away: float | None
 
 
 def _furnishings(seed: int, number: int, doorways: Mapping[float, float]) -> list[Part]:
-    """What stands in room `number` of a building and hangs on its walls."""
+    """What stands in room `number` of a building, and what hangs on its walls."""
     desk = f.desk(seed)
     rug = Material("rug", tile_m=(2.3, 1.6, 1.0))
     hanging = Material("plain", (1.0, 0.97, 0.88), glow=0.85)
@@ -132,7 +133,7 @@ def build_room(seed: int = 0) -> Room:
 
 
 def build_building(rooms: int, seed: int = 0) -> Room:
-    """Rooms in a row, each open to the next; they differ in their pictures, books and the paint of their walls."""
+    """Rooms in a row, each open to the next; they differ in pictures, books and the paint of the walls."""
     origins = [room_origin(number) for number in range(rooms)]
     each = []
     for number, (x, y, _) in enumerate(origins):
@@ -144,23 +145,23 @@ def build_building(rooms: int, seed: int = 0) -> Room:
 
 
 def room_origin(number: int) -> Floats:
-    """The middle (3,) of the floor of a building's room: its south door is where the north door of the last one is."""
+    """The middle (3,) of the floor of a building's room, whose south door is the north door of the room before."""
     return number * np.array([NORTH_DOOR + SOUTH_DOOR, DEPTH + 0.2, 0.0])
 
 
 def _repainted(parts: list[Part], rng: np.random.Generator) -> list[Part]:
-    """The parts, with other colours of plaster."""
+    """The parts with the plaster of their walls in another colour."""
     paint = rng.uniform(0.75, 1.0, 3)
 
-    def painted(material: Material) -> Material:
+    def repainted(material: Material) -> Material:
         red, green, blue = (float(value) for value in np.multiply(material.tint, paint))
         return replace(material, tint=(red, green, blue)) if material.texture == "plaster" else material
 
-    return [replace(p, material=painted(p.material)) for p in parts]
+    return [replace(p, material=repainted(p.material)) for p in parts]
 
 
 def _joined(rooms: list[list[Part]], origins: list[Floats], seed: int) -> Room:
-    """One mesh of the rooms, each lit by a lamp of its own."""
+    """One mesh of rooms with these origins, each lit by a lamp of its own."""
     parts = [p for room in rooms for p in room]
     meshes = [p.mesh.moved(p.room_from_part) for p in parts]
     starts = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])

@@ -1,4 +1,4 @@
-"""The demo's data: the room seen along the loop, written as a TUM RGB-D sequence."""
+"""The demo's sequences: a room or building seen along a path, written in the TUM RGB-D layout, and their cache."""
 
 from __future__ import annotations
 
@@ -32,13 +32,19 @@ from hodge_pipeline.types.input_files import read_input_text
 VERSION = 3
 """Raised whenever the same options give other files, so that nobody goes on with old ones."""
 STAMP_FILE = "demo.json"
+"""The file that says by which options a folder was made."""
 FIRST_STAMP_S = 1_400_000_000.0
+"""Unix time, as TUM's stamps are."""
 CAMERA_HZ, TRUTH_HZ = 30.0, 100.0
 UNITS_PER_METRE = 5000
+"""Of depth images, as TUM's."""
 FOCAL_SHARE_OF_WIDTH = 525 / 640
+"""Focal length of the first Kinect."""
 JPEG_QUALITY = 92
 FULL_LOOP, STEP_DEG = 1.12, 3.4
+"""Rounds of a path that closes its loop, and the turn between neighbours for which frames must suffice."""
 CACHED_SEQUENCES, ABANDONED_S = 4, 86_400.0
+"""Sequences that the cache keeps, and the age of a draft whose process was killed."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -80,7 +86,7 @@ class DemoOptions:
 
     @property
     def rounds(self) -> float:
-        """`turns`, or what stands for none."""
+        """`turns`, or the default that suits the number of frames."""
         if self.turns is not None:
             return self.turns
         reach = self.frames * STEP_DEG / 360
@@ -140,21 +146,21 @@ class BuildingOptions:
 
 
 class World(Protocol):
-    """Options of a modelled world that can be written as a sequence of `frames`."""
+    """Options of a modelled world that writes itself as a sequence."""
 
     @property
     def frames(self) -> int:
-        """How many there are."""
+        """How many frames the sequence has."""
 
     def write(self, draft: Path, advance: Advance) -> None:
-        """Everything into an empty folder; `advance(1)` after each frame."""
+        """Write the sequence into an empty folder; calls `advance(1)` after each frame."""
 
 
 def make_sequence(folder: Path | str, options: World | None = None, advance: Advance = no_progress) -> Path:
-    """The folder, holding what these options write; one that holds it already is left as it is.
+    """The folder with the sequence of these options, written unless it is there already.
 
-    It is made beside the folder and renamed when complete, so that a killed run leaves no half of it. `advance(1)` is
-    called after each frame. `SourceError` where the folder holds anything else.
+    It is written beside the folder and renamed when complete, so that a killed process leaves no half of it.
+    `advance(1)` is called after each frame. Raises `SourceError` where the folder holds anything else.
     """
     folder, options = Path(folder), options or DemoOptions()
     if _is_made(folder, options):
@@ -181,9 +187,9 @@ def make_sequence(folder: Path | str, options: World | None = None, advance: Adv
 
 
 def demo_source(options: World, advance: Advance = no_progress) -> Path:
-    """The folder of the demo sequence in the user's cache, made at the first call.
+    """The folder of the sequence in the user's cache, written at the first call.
 
-    The cache is `$XDG_CACHE_HOME/hodge-pipeline`, else `~/.cache/hodge-pipeline`; it keeps the last few sequences used.
+    The cache, `$XDG_CACHE_HOME/hodge-pipeline` or `~/.cache/hodge-pipeline`, keeps the sequences used last.
     """
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hodge-pipeline"
     key = hashlib.sha256(_stamp(options).encode()).hexdigest()[:12]
@@ -194,7 +200,7 @@ def demo_source(options: World, advance: Advance = no_progress) -> Path:
 
 
 def _forget_oldest(cache: Path, keep: Path) -> None:
-    """Remove all but the sequences used last, and what killed runs left; nothing else in the cache is touched."""
+    """Remove all but the sequences used last, and drafts of killed processes; nothing else in the cache."""
     for draft in cache.glob(".demo-*.partial"):
         if time.time() - draft.stat().st_mtime > ABANDONED_S:
             shutil.rmtree(draft, ignore_errors=True)
@@ -205,6 +211,7 @@ def _forget_oldest(cache: Path, keep: Path) -> None:
 
 
 def _stamp(options: World) -> str:
+    """What identifies the sequence of these options."""
     told = {"version": VERSION, "world": type(options).__name__, "options": asdict(options)}  # type: ignore[call-overload]
     return json.dumps(told, indent=1, sort_keys=True) + "\n"
 
@@ -215,7 +222,7 @@ def _is_made(folder: Path, options: World) -> bool:
 
 
 def _publish(draft: Path, folder: Path, options: World) -> None:
-    """Rename the draft; where another process was first, its sequence is the same and stays."""
+    """Rename the draft; where another process was first, its equal sequence stays."""
     draft.chmod(0o755)
     try:
         draft.rename(folder)
@@ -225,7 +232,7 @@ def _publish(draft: Path, folder: Path, options: World) -> None:
 
 
 def _write(draft: Path, options: DemoOptions | BuildingOptions, advance: Advance) -> None:
-    """The complete sequence; the frames are rendered by two threads, and no frame depends on another."""
+    """Write the complete sequence; two threads render, since no frame depends on another."""
     rng = np.random.default_rng([options.seed, 2])
     colour_s = np.arange(options.frames) * options.stride / CAMERA_HZ + rng.uniform(0, 0.002, options.frames) + 0.05
     depth_s = colour_s + rng.uniform(-0.006, 0.006, options.frames)
@@ -252,27 +259,27 @@ class _Recorder:
         self.renderer = Renderer(options.build(), options.camera)
 
     def record(self, number: int, colour_s: float, depth_s: float) -> tuple[str, str]:
-        """The names of the colour and the depth image, below the sequence's folder."""
+        """Write a frame; the paths of its colour and depth image in the sequence's folder."""
         rng = np.random.default_rng([self.options.seed, 3, number])
         image = photographed(
             self.renderer.colour(self._poses(colour_s), self._moved(colour_s)), rng, self.options.noise
         )
         depth_m = measured_depth(*self.renderer.depth(self._poses(depth_s)), rng, self.options.noise)
-        colour_name, depth_name = f"rgb/{_at(colour_s)}.jpg", f"depth/{_at(depth_s)}.png"
+        colour_name, depth_name = f"rgb/{_stamp_of(colour_s)}.jpg", f"depth/{_stamp_of(depth_s)}.png"
         jpeg = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
         _write_image(self.folder / colour_name, image[..., ::-1], jpeg)
         _write_image(self.folder / depth_name, np.rint(depth_m * UNITS_PER_METRE).astype(np.uint16), [])
         return colour_name, depth_name
 
     def _poses(self, time_s: float) -> Floats:
-        """The camera's pose (4, 4), or those (H, 4, 4) of rows of a rolling shutter, whose middle is at this time."""
+        """The pose (4, 4) at a time, or with a rolling shutter those (H, 4, 4) of its rows, the middle one at it."""
         camera = self.options.camera
         if not camera.readout_s:
             return np.asarray(self.path.world_from_cam(np.array([time_s]))[0])
         return self.path.world_from_cam(time_s + camera.readout_s * (np.arange(camera.height) / camera.height - 0.5))
 
     def _moved(self, time_s: float) -> Floats | None:
-        """The camera's motion (6,) while its shutter is open, in its own axes; None of one that takes no time."""
+        """The camera's twist (6,) while its shutter is open, in its own axes; None without an exposure time."""
         half_s = self.options.exposure_s / 2
         if not half_s:
             return None
@@ -280,8 +287,8 @@ class _Recorder:
         return se3.log(se3.inverse(begin) @ end)
 
 
-def _at(time_s: float) -> str:
-    """The stamp of a time as names and lists carry it."""
+def _stamp_of(time_s: float) -> str:
+    """The stamp of a time in names and lists."""
     return f"{FIRST_STAMP_S + time_s:.6f}"
 
 
@@ -303,7 +310,9 @@ def _write_truth(path: Path, loop: HandHeldLoop | Walk) -> None:
     times_s = np.arange(0, loop.duration_s + 0.2, 1 / TRUTH_HZ) + 0.0037
     world_from_cam: Floats = loop.world_from_cam(times_s)
     rows = np.concatenate([world_from_cam[:, :3, 3], se3.to_quat_xyzw(world_from_cam)], axis=1)
-    lines = [f"{_at(t)} " + " ".join(f"{value:.7f}" for value in row) for t, row in zip(times_s, rows, strict=True)]
+    lines = [
+        f"{_stamp_of(t)} " + " ".join(f"{value:.7f}" for value in row) for t, row in zip(times_s, rows, strict=True)
+    ]
     path.write_text("\n".join(["# ground truth trajectory", "# timestamp tx ty tz qx qy qz qw", *lines]) + "\n")
 
 

@@ -49,7 +49,7 @@ def box(width: float, depth: float, height: float) -> Mesh:
 
 
 def lathe(profile: Sequence[tuple[float, float]], sides: int = 24) -> Mesh:
-    """The surface that a profile of (radius, z), from bottom to top, sweeps about the z axis.
+    """The surface of revolution about the z axis of a profile of (radius, z), from bottom to top.
 
     Each piece of the profile is smooth round the axis; the normals of neighbouring pieces are averaged where they
     differ by less than 45 degrees.
@@ -75,7 +75,7 @@ def lathe(profile: Sequence[tuple[float, float]], sides: int = 24) -> Mesh:
 
 
 def cylinder(radius: float, height: float, sides: int = 24) -> Mesh:
-    """A closed cylinder."""
+    """A closed cylinder about the z axis."""
     return lathe([(0, 0), (radius, 0), (radius, height), (0, height)], sides)
 
 

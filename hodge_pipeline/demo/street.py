@@ -1,13 +1,14 @@
 """A modelled street block: facades, cars, trees and lamps along a closed road; x and y on the ground, z up; metres.
 
-The north and the south street are the same to the last lamp, the west side is a tunnel with nothing in it, and a few
-cars drive: what makes a scanner's life hard out of doors.
+It has what is hard for a scanner out of doors: the north and the south street are equal to the last lamp, the west side
+is an empty tunnel, and a few cars drive.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,15 +18,24 @@ from hodge_pipeline.demo.shapes import Mesh, ball, box, cylinder
 from hodge_pipeline.types import Floats, Ints
 
 HALF_LENGTH_M, HALF_WIDTH_M, CORNER_M = 80.0, 52.0, 16.0
-"""Of the road's middle line: 500 m round."""
+"""Of the road's middle line, and the radius of its corners: 500 m round."""
 KERB_M, HOUSES_M = 5.5, 8.0
-"""From the road's middle line to what stands on the pavement, and to the facades."""
+"""From the road's middle line to the pavement's trees, lamps and cars, and to the facades."""
 TUNNEL_M, TUNNEL_HALF_WIDTH_M, TUNNEL_HEIGHT_M = 60.0, 5.0, 5.0
 GROUND_M = 500.0
 CAR = (4.4, 1.8, 1.5)
+"""Length, width and height."""
 SCANNER_HEIGHT_M = 1.9
 WOBBLE_DEG, WOBBLE_M = 0.6, 0.02
-"""Of the car's body on its springs."""
+"""Amplitudes of the car's body on its springs."""
+
+
+class Place(NamedTuple):
+    """Places on the road: `x`, `y` metres, `heading` radians, each (…)."""
+
+    x: Floats
+    y: Floats
+    heading: Floats
 
 
 @dataclass(frozen=True)
@@ -36,12 +46,12 @@ class Road:
 
     @property
     def length_m(self) -> float:
-        """Once round."""
+        """The length of one round."""
         return float(self._starts[-1])
 
     @property
     def _pieces(self) -> list[tuple[float, float, float, float]]:
-        """(x, y, heading at its start, length) of each straight, a corner behind each."""
+        """(x, y, heading, length) at the start of each straight; a corner follows each."""
         along, across = 2 * (HALF_LENGTH_M - CORNER_M), 2 * (HALF_WIDTH_M - CORNER_M)
         return [
             (-HALF_LENGTH_M + CORNER_M, -HALF_WIDTH_M, 0.0, along),
@@ -52,25 +62,25 @@ class Road:
 
     @property
     def _starts(self) -> Floats:
-        """The way (9,) at which each straight and each corner begins, and the whole."""
+        """The way (9,) at which each straight and each corner begins, and that of the whole round."""
         lengths = [part for *_, length in self._pieces for part in (length, CORNER_M * np.pi / 2)]
         return np.concatenate([[0.0], np.cumsum(lengths)])
 
     def world_from_car(self, times_s: Floats) -> Floats:
         """Poses (N, 4, 4) of the scanner: x ahead, y left, z up."""
         times_s = np.asarray(times_s, float)
-        x, y, heading = self.place(times_s * self.speed_m_s)
+        place = self.place(times_s * self.speed_m_s)
         turned = np.zeros((len(times_s), 3))
-        turned[:, 2] = heading
-        position = np.stack([x, y, np.full(len(x), SCANNER_HEIGHT_M)], axis=1)
+        turned[:, 2] = place.heading
+        position = np.stack([place.x, place.y, np.full(len(times_s), SCANNER_HEIGHT_M)], axis=1)
         waves = np.sin(2 * np.pi * times_s[:, None] * np.array([0.9, 1.3, 0.7, 1.1]) + np.array([0.3, 1.7, 2.9, 4.2]))
         twist = np.zeros((len(times_s), 6))
         twist[:, :2] = np.radians(WOBBLE_DEG) * waves[:, :2]
         twist[:, 4:] = WOBBLE_M * waves[:, 2:]
         return np.asarray(se3.from_parts(se3.so3_exp(turned), position) @ se3.exp(twist))
 
-    def place(self, way_m: Floats) -> tuple[Floats, Floats, Floats]:
-        """x, y and heading, radians, after a way on the middle line."""
+    def place(self, way_m: Floats) -> Place:
+        """The place after a way (…) on the middle line, in metres; any number of rounds."""
         starts = self._starts
         way = np.mod(way_m, starts[-1])
         piece = np.clip(np.searchsorted(starts, way, side="right") - 1, 0, 7)
@@ -81,11 +91,11 @@ class Road:
         ahead, left = straight + CORNER_M * np.sin(angle), CORNER_M * (1 - np.cos(angle))
         x = x0 + np.cos(heading0) * ahead - np.sin(heading0) * left
         y = y0 + np.sin(heading0) * ahead + np.cos(heading0) * left
-        return x, y, heading0 + angle
+        return Place(x, y, heading0 + angle)
 
 
 def build_street(seed: int) -> tuple[Floats, Ints]:
-    """Vertices (V, 3) and triangles (T, 3) of all that stands."""
+    """Vertices (V, 3) and triangles (T, 3) of everything that does not drive."""
     rng = np.random.default_rng([seed, 7])
     half_turn = motion(0, 0, yaw_deg=180)
     south = list(_side(rng, HALF_LENGTH_M, HALF_WIDTH_M))
@@ -110,7 +120,7 @@ def _side(rng: np.random.Generator, half_length_m: float, away_m: float) -> Iter
 
 
 def _house(rng: np.random.Generator, x: float, y: float, facing: float, width: float, height: float) -> Iterator[Mesh]:
-    """A house whose facade at `y` looks along `facing` y, with a door step, bays and balconies."""
+    """A house whose facade at `y` looks along `facing` y (±1), with a door step, bays and balconies."""
     yield box(width, 9.0, height).moved(motion(x, y - facing * 4.5))
     for _ in range(rng.integers(1, 5)):
         wide, deep, tall = rng.uniform(0.8, 3.0), rng.uniform(0.3, 1.2), rng.uniform(0.3, 2.8)
@@ -141,7 +151,7 @@ def _tunnel() -> list[Mesh]:
 
 
 def joined(meshes: list[Mesh]) -> tuple[Floats, Ints]:
-    """Vertices (V, 3) and triangles (T, 3) of all of them."""
+    """Vertices (V, 3) and triangles (T, 3) of the meshes as one."""
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     triangles = [mesh.triangles + start for mesh, start in zip(meshes, starts, strict=True)]
     return np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(triangles)

@@ -1,4 +1,4 @@
-"""What a spinning scanner on a car measures of the street: points with their times, one file a revolution."""
+"""The sweeps of a spinning LiDAR on a car in the street: points with their times, one file a revolution."""
 
 from __future__ import annotations
 
@@ -17,23 +17,28 @@ from hodge_pipeline.types import Floats, Floats32, Ints
 
 REVOLUTION_S = 0.1
 LOWEST_DEG, HIGHEST_DEG = -24.0, 6.0
+"""Elevation of the lowest and the highest beam."""
 NEAREST_M, FARTHEST_M = 2.0, 80.0
+"""Range of the scanner."""
 RANGE_NOISE_M, LOST_SHARE = 0.02, 0.03
+"""Standard deviation of a range, and the share of points that is lost."""
 TRUTH_FILE = "truth.tum"
 MOVING_CARS, ONCOMING_M_S, LANE_M = 5, 7.0, 3.0
+"""Oncoming cars, their speed, and the distance of their lane."""
 
 
 @plain_dataclass(frozen=True)
 class Sweep:
-    """One revolution: `points (N, 3)` in the scanner's axes at the time of each, `times_s (N,)` after the first."""
+    """One revolution: `points (N, 3)` in the scanner's axes at their own times, `times_s (N,)` after it began."""
 
     points: Floats32
     times_s: Floats32
 
 
 class SpinningScanner:
-    """A scanner of `beams` and `columns` on a car that drives the road, past the street or another mesh (vertices,
-    triangles).
+    """A scanner of `beams` and `columns` on a car that drives the road, in the street or another `mesh`.
+
+    The mesh is vertices (V, 3) and triangles (T, 3); `noise` multiplies every error.
     """
 
     nearest_m = NEAREST_M
@@ -49,11 +54,11 @@ class SpinningScanner:
             o3d.core.Tensor.from_numpy(triangles.astype(np.uint32)),
         )
         up = np.radians(np.linspace(LOWEST_DEG, HIGHEST_DEG, beams))
-        round_ = -2 * np.pi * np.arange(columns) / columns
+        azimuth = -2 * np.pi * np.arange(columns) / columns
         self._directions = np.stack(
             [
-                np.cos(up) * np.cos(round_)[:, None],
-                np.cos(up) * np.sin(round_)[:, None],
+                np.cos(up) * np.cos(azimuth)[:, None],
+                np.cos(up) * np.sin(azimuth)[:, None],
                 np.broadcast_to(np.sin(up), (columns, beams)),
             ],
             axis=2,
@@ -61,7 +66,7 @@ class SpinningScanner:
         self._column_s = REVOLUTION_S * np.arange(columns) / columns
 
     def sweep(self, number: int) -> Sweep:
-        """The revolution that begins at `number` tenths of a second."""
+        """The revolution that begins `number` revolutions after the first."""
         rng = np.random.default_rng([self.seed, 8, number])
         begin_s = number * REVOLUTION_S
         poses = self.road.world_from_car(begin_s + self._column_s)
@@ -76,11 +81,11 @@ class SpinningScanner:
         return Sweep(points[seen].astype(np.float32), times[seen].astype(np.float32))
 
     def _to_cars(self, rays: Floats, time_s: float) -> Floats:
-        """The range at which each ray meets a moving car, infinite where it meets none."""
+        """The range (columns, beams) at which each ray hits a moving car, infinite where it hits none."""
         nearest = np.full(rays.shape[:2], np.inf)
         for number in range(MOVING_CARS):
             way = 37.0 + self.road.length_m * number / MOVING_CARS - ONCOMING_M_S * time_s
-            x, y, heading = (float(value) for value in self.road.place(np.array(way)))
+            x, y, heading = map(float, self.road.place(np.array(way)))
             lane = se3.from_parts(se3.so3_exp(np.array([0, 0, heading])), np.array([x, y, 0.2]))
             car_from_world = se3.inverse(lane @ se3.from_parts(np.eye(3), np.array([0.0, LANE_M, 0.0])))
             nearest = np.minimum(nearest, _to_box(_in_frame(car_from_world, rays), np.array(CAR)))
@@ -95,7 +100,7 @@ def _in_frame(b_from_a: Floats, rays: Floats) -> Floats:
 
 
 def _to_box(rays: Floats, size: Floats) -> Floats:
-    """Where rays (…, 6) meet a box that stands on the origin: the slab test."""
+    """The range (…) at which rays (…, 6) hit a box of this size that stands on the origin, by the slab test."""
     low, high = np.array([-size[0] / 2, -size[1] / 2, 0.0]), np.array([size[0] / 2, size[1] / 2, size[2]])
     with np.errstate(divide="ignore", invalid="ignore"):
         a, b = (low - rays[..., :3]) / rays[..., 3:], (high - rays[..., :3]) / rays[..., 3:]

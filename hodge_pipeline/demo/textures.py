@@ -9,10 +9,10 @@ import numpy as np
 
 from hodge_pipeline.types import Floats, Floats32, Ints
 
-SIZE = 256
-LEVELS = 7
-PICTURES = 10
-SPINES = 12
+SIZE, LEVELS = 256, 7
+"""Pixels of a texture's side, a power of two, and its mip levels."""
+PICTURES, SPINES = 10, 12
+"""Textures of these kinds."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Textures:
 
 
 def _clouds(rng: np.random.Generator, roughness: float, stretch: float = 1.0) -> Floats:
-    """Repeating fractal noise (SIZE, SIZE) in 0..1, finer where roughness is small, drawn out along rows by stretch."""
+    """Repeating fractal noise (SIZE, SIZE) in 0..1, finer for a small roughness, stretched along rows."""
     frequency = np.fft.fftfreq(SIZE) * SIZE
     radius = np.hypot(frequency[:, None], stretch * frequency[None, :])
     spectrum = np.fft.fft2(rng.standard_normal((SIZE, SIZE))) / np.maximum(radius, 1.0) ** roughness

@@ -1,1 +1,1 @@
-"""Evaluation: scores, trajectory errors, the report."""
+"""Measures of poses: scores of overlapping clouds, trajectory errors, residuals of edges."""

@@ -1,4 +1,4 @@
-"""The point-to-plane distance of two clouds under given poses, for a block of pairs in a worker process."""
+"""Point-to-plane distances of pairs of clouds under given poses, for a block of pairs in a worker process."""
 
 from __future__ import annotations
 
@@ -13,18 +13,17 @@ import small_gicp
 from hodge_pipeline.types import CloudSet, Floats, Ints, PointCloud
 
 REACH_M = 0.1
-"""A point further from the other cloud than this shows what the other does not see."""
-
+"""A point farther from the other cloud shows what the other does not see."""
 NO_NEIGHBOUR_M = 0.1
-"""The distance of two clouds without a single point in reach."""
+"""The distance of two clouds without a point in reach."""
 
 
 @dataclass(frozen=True)
 class DistanceBlock:
-    """Pairs (P, 2) sorted by their first cloud, and their motions `i_from_j (S, P, 4, 4)` in S sets of poses.
+    """Pairs (P, 2), rows of clouds sorted by the first, and their motions `i_from_j (S, P, 4, 4)` in S sets of poses.
 
-    `scale`: what the reach is taken times, for scenes that are no rooms. Of each second cloud at most `points`, evenly
-    strided, are measured.
+    Lengths are multiplied by `scale`, for scenes that are no rooms. At most `points` points of each second cloud,
+    evenly strided, are measured.
     """
 
     clouds_folder: Path
@@ -37,7 +36,7 @@ class DistanceBlock:
 def block_distances(block: DistanceBlock) -> Floats:
     """The distances d (S, P) in metres of a block's pairs; NaN where a motion is not finite.
 
-    The tree of cloud i lies in its own camera's axes, so one tree serves all its pairs and all sets of poses.
+    The search tree of cloud i is in its own camera's axes, so that one serves all its pairs and all sets of poses.
     """
     clouds = CloudSet.open(block.clouds_folder)
     out = np.full(block.i_from_j.shape[:2], np.nan)
@@ -51,6 +50,7 @@ def block_distances(block: DistanceBlock) -> Floats:
 
 
 def _columns_by_target(pairs: Ints) -> Iterator[tuple[int, list[int]]]:
+    """(i, columns) of the pairs of each first cloud i."""
     for i, columns in groupby(range(len(pairs)), key=lambda column: int(pairs[column, 0])):
         yield i, list(columns)
 
@@ -70,7 +70,10 @@ class TargetPlanes:
             self.low, self.high = self.points.min(axis=0) - self.reach_m, self.points.max(axis=0) + self.reach_m
 
     def distance(self, points_in_j: Floats, i_from_j: Floats) -> float:
-        """Mean |n·(p − q)| in metres over the points within reach; 0.1 m, times the scale, when there is none."""
+        """Mean |n·(p − q)| in metres over points p (N, 3) whose nearest neighbour q is within reach.
+
+        0.1 m times the scale where no point is; NaN where the motion (4, 4) is not finite.
+        """
         if not np.isfinite(i_from_j).all():
             return float("nan")
         if self.tree is None or not len(points_in_j):

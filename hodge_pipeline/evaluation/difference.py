@@ -1,4 +1,4 @@
-"""What a difference between two values of one measure comes to: better, worse, or none that was measured."""
+"""Whether a value got better or worse, and by how much, in words; differences too small to measure are none."""
 
 from __future__ import annotations
 
@@ -13,15 +13,17 @@ from hodge_pipeline.types import Floats
 Better: TypeAlias = Literal["lower", "higher"]
 
 SAME = 0.02
-"""A relative change below this counts as none: a truth of the kind that RGB-D benchmarks have is no finer."""
+"""Relative change of an error that counts as none: the truth of RGB-D benchmarks is no more exact."""
 MEASURABLE = 1e-6
-"""Of the scene's extent, and in radians of an angle: the least difference that is one. Clouds are held in single
+"""Least measurable difference, as a share of the scene's extent, and of an angle in radians. Clouds are held in single
 precision, which rounds a coordinate by 6e-8 of itself; a pose and a distance add up some ten such roundings."""
+NEAR_WHOLE = 1e-9
+"""What a change of units may add to a whole number."""
 VERBS = {1: "fell", 0: "hardly changed,", -1: "rose"}
 
 
 def sign_of(before: float, after: float, tolerance: float, better: Better = "lower") -> int:
-    """1 better, −1 worse, 0 where the difference is within the tolerance; a value that is lost (NaN) is worse."""
+    """1 better, −1 worse, 0 within the tolerance; a value that became NaN is worse, one that was NaN counts as 0."""
     if before != before:
         return 0
     gain = before - after if better == "lower" else after - before
@@ -29,7 +31,7 @@ def sign_of(before: float, after: float, tolerance: float, better: Better = "low
 
 
 def floor_of(*positions: Floats) -> float:
-    """The least length (m) that was measured: `MEASURABLE` of the extent of these positions (N, 3) each."""
+    """The least measurable length in metres: `MEASURABLE` of the largest extent of these sets of positions (N, 3)."""
     known = [one[np.isfinite(one).all(axis=1)] for one in positions]
     return MEASURABLE * max((float(np.linalg.norm(np.ptp(one, axis=0))) for one in known if len(one)), default=0.0)
 
@@ -38,7 +40,7 @@ def floor_of(*positions: Floats) -> float:
 class Change:
     """One error before and after, lower is better: a length in metres or an angle in degrees (`unit`).
 
-    `short` names it in a headline; a difference of up to `floor` was not measured.
+    `what` names it in a sentence, `short` in a headline; a difference up to `floor` is not measurable.
     """
 
     what: str
@@ -50,12 +52,12 @@ class Change:
 
     @property
     def is_measured(self) -> bool:
-        """Whether there is any difference above the floor."""
+        """Whether the difference is above the floor."""
         return not abs(self.after - self.before) <= self.floor
 
     @property
     def share(self) -> float:
-        """−0.4 where the error fell by 40 %; NaN where nothing was measured before, and now is."""
+        """Relative change: −0.4 where the error fell by 40 %; NaN where it was below the floor and rose above it."""
         if not self.is_measured:
             return 0.0
         return (self.after - self.before) / self.before if self.before > self.floor else float("nan")
@@ -84,14 +86,14 @@ class Change:
 
     @property
     def values(self) -> tuple[str, str]:
-        """Before and after in the same unit, with digits alike."""
+        """Before and after in one unit, with the same decimals."""
         larger = max((value for value in (self.before, self.after) if value < float("inf")), default=0.0)
         factor, unit = (1.0, "°") if self.unit == "°" else _unit(larger)
         before, after = (f"{text}{unit}" for text in alike(self.before * factor, self.after * factor))
         return self._or_floor(self.before, before), self._or_floor(self.after, after)
 
     def _or_floor(self, value: float, text: str) -> str:
-        """The text of a value, unless that is below the floor or no number."""
+        """The text of a value, replaced where that is below the floor or not finite."""
         if self.floor <= abs(value) < float("inf"):
             return text
         return angle(value, self.floor) if self.unit == "°" else length(value, None, self.floor)
@@ -102,7 +104,7 @@ class Change:
 
 
 def length(metres: float, unit_of_m: float | None = None, floor_m: float = 0.0) -> str:
-    """A length with a unit that suits its size, or the size `unit_of_m` of another; `< 0.005 mm` below the floor."""
+    """A length with the unit that suits it, or suits the length `unit_of_m`; `< 0.005 mm` below the floor."""
     if not abs(metres) < float("inf"):
         return "–"
     if abs(metres) < floor_m:
@@ -120,19 +122,15 @@ def _unit(size_m: float) -> tuple[float, str]:
     return (1.0, " m") if size_m < 999.5 else (0.001, " km")
 
 
-ROUNDING = 1e-9
-"""Of a whole number, by a change of units."""
-
-
 def alike(before: float, after: float, digits: int = 3) -> tuple[str, str]:
-    """Two numbers of one change with the same decimals, so many that the larger has these significant digits.
+    """Two numbers with the same decimals, so that the larger has `digits` significant ones.
 
-    Whole numbers have none; a smaller one that this leaves less than two digits has two.
+    Whole numbers have no decimals; a small number that this leaves fewer than two digits has two.
     """
     larger = max(abs(before), abs(after))
     if not 1e-3 <= larger < 1e6:  # too small or too large for decimals, or no number
         return f"{before:.{digits}g}", f"{after:.{digits}g}"
-    is_whole = all(abs(value - round(value)) < ROUNDING for value in (before, after) if math.isfinite(value))
+    is_whole = all(abs(value - round(value)) < NEAR_WHOLE for value in (before, after) if math.isfinite(value))
     decimals = 0 if is_whole else max(digits - 1 - math.floor(math.log10(larger)), 0)
     least = 0.0 if is_whole else 10.0 ** (1 - decimals)
     first, second = (
@@ -149,5 +147,5 @@ def angle(degrees: float, floor_deg: float = 0.0) -> str:
 
 
 def percent(share: float) -> str:
-    """A signed share in per cent, with a real minus sign; none of what rounds to 0."""
+    """A share in per cent with its sign, a real minus; `0 %` without one."""
     return f"{share * 100:+.0f} %".replace("-", "−") if abs(share) >= 0.005 else "0 %"

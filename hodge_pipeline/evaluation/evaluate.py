@@ -1,4 +1,4 @@
-"""The scores of a run's rounds."""
+"""The scores of the poses of a run's rounds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from hodge_pipeline.types import CloudSet, Floats, Source
 def score_rounds(
     source: Source, clouds: CloudSet, rounds: Sequence[Round], scale: float, steps: Steps, workers: Workers
 ) -> ScoreTable:
-    """The score tables of the true poses (where there are any) and of every round; lengths are in units of `scale`."""
+    """The scores of every round and of the true poses where there are any, which then are the reference.
+
+    Lengths of the scores are multiplied by `scale`.
+    """
     sets = pose_sets(rounds, source)
     sets = {"truth": true_poses(source), **sets} if has_truth(source) else sets
     reference = "truth" if has_truth(source) else "result"
@@ -23,6 +26,6 @@ def score_rounds(
 def evaluate(
     clouds: CloudSet, sets: dict[str, Floats], reference: str, scale: float, *, workers: Workers, step: Step
 ) -> ScoreTable:
-    """Step: the scores of each set of poses (K, 4, 4), on the pairs that overlap under the reference."""
+    """Step: the scores of named sets of poses (K, 4, 4), on the pairs that overlap under the `reference` one."""
     assert clouds.folder is not None
     return score_table(clouds.folder, sets, reference, workers, scale=scale)

@@ -1,4 +1,4 @@
-"""How far each measured edge is from the poses."""
+"""Residuals of measured edges at given poses."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from hodge_pipeline.types.edges import DISABLED, IGNORED, USED
 
 
 def edge_residuals(graph: ViewGraph, world_from_cam: Floats) -> tuple[Floats, Floats]:
-    """Translation (E,) in metres and angle (E,) in radians of `Z_ij⁻¹ T_i⁻¹ T_j`, the motion left over in j's axes.
+    """Translation (E,) in metres and angle (E,) in radians of `Z_ij⁻¹ T_i⁻¹ T_j`, the residual motion in j's axes.
 
-    `world_from_cam (V, 4, 4)`; NaN where either pose is not finite.
+    T is `world_from_cam (V, 4, 4)`, Z the edge's `i_from_j`. NaN where either pose is not finite.
     """
     first, second = world_from_cam[graph.edges[:, 0]], world_from_cam[graph.edges[:, 1]]
     left_over = se3.inverse(graph.i_from_j) @ se3.inverse(first) @ second
@@ -24,7 +24,7 @@ def edge_residuals(graph: ViewGraph, world_from_cam: Floats) -> tuple[Floats, Fl
 
 
 def with_residuals(edges: Edges, world_from_cam: Floats, weights: Floats) -> Edges:
-    """The table with weight, residual and status of the edges of its graph, whose `weights (G,)` a solver gave them."""
+    """The table with weight, residual and status of its G edges in the graph, by poses (V, 4, 4) and `weights (G,)`."""
     rows = np.flatnonzero(edges.in_graph)
     graph = edges.as_graph(np.arange(len(world_from_cam)), rows)
     translation_m, angle_rad = edge_residuals(graph, world_from_cam)

@@ -1,7 +1,7 @@
-"""How well the clouds lie on each other under a set of poses: the paper's score, on graphs of overlapping frames.
+"""The paper's score of a set of poses: how well clouds of overlapping frames fit, exp(−d/σ) of their distance d.
 
-Every set of poses is scored on the same edges, those of the reference poses, because only then does a difference
-between two sets mean anything. For the same reason the score is always printed beside the reference's own.
+Scores of two sets of poses compare only on the same edges. So every set is scored on those of the reference poses, and
+its score is always printed beside the reference's own.
 """
 
 from __future__ import annotations
@@ -26,19 +26,18 @@ GraphKind: TypeAlias = Literal["distance", "iou"]
 GRAPH_KINDS: tuple[GraphKind, ...] = get_args(GraphKind)
 
 SIGMA_M = 0.069
-"""σ of the score: the paper gives none; with this one the true poses of red kitchen score the paper's 0.863."""
-
+"""σ of the score. The paper states none; with this one the true poses of red kitchen score the paper's 0.863."""
 CENTROID_DISTANCE_M = 0.2
-IOU = 0.5
-IOU_VOXEL_M = 0.1
+"""Distance of centroids below which frames overlap, in the paper's distance graph."""
+IOU, IOU_VOXEL_M = 0.5, 0.1
+"""Intersection over union above which frames overlap, in the paper's IoU graph, and the side of the voxels."""
 MOST_PAIRS = 1500
-"""Pairs of a graph that are scored: the mean of so many is known to a fifth of a millimetre (red kitchen)."""
+"""Pairs of a graph that are scored: their mean distance is known to a fifth of a millimetre (red kitchen)."""
 MOST_FRAMES = 500
-"""Frames whose pairs with all others are looked for: 1500 pairs are taken of what they give."""
+"""Frames whose pairs with all others are listed, of which `MOST_PAIRS` are scored."""
 MOST_POINTS, LEAST_POINTS = 1_000_000, 500
-"""Points measured of all pairs together, and at least of each: of the 500 pairs of red kitchen a third, of the 1200 of
-fr1/rpy an eighth, which changes their mean scores by two ten-thousandths; of 150 pairs all. Every set of poses is
-measured with the same.
+"""Points measured of all pairs together, and at least of each: a third of those of 500 pairs (red kitchen), an eighth
+of 1200 (fr1/rpy), which changes mean scores by two ten-thousandths. Every set of poses is measured with the same.
 """
 PAIRS_PER_BLOCK = 96
 """About half a second of work: long against the cost of sending a block, short against a whole run."""
@@ -47,9 +46,10 @@ PAIRS_PER_BLOCK = 96
 def evaluation_pairs(clouds: CloudSet, world_from_cam: Floats, kind: GraphKind, scale: float = 1.0) -> Ints:
     """The edges (P, 2), i < j and sorted, on which poses are scored: near centroids, or overlapping voxels.
 
-    `distance`: centroids closer than 0.2 m in the world. `iou`: intersection over union of the occupied 0.1 m voxels of
-    the world above 0.5. A frame without points, or whose pose (4, 4) is not finite, has no edges. Of more than 500
-    frames the edges of 500 are found, evenly spread. Lengths are taken times `scale`.
+    `distance`: centroids closer than 0.2 m in the world. `iou`: intersection over union of occupied 0.1 m voxels of
+    the world above 0.5. Frames without points, or whose pose (N, 4, 4) is not finite, have no edges. Of more than 500
+    frames those of 500, evenly spread, are listed. Lengths are times `scale`. Raises `GraphError` where there is not
+    one pose for each cloud.
     """
     if len(clouds) != len(world_from_cam):
         raise GraphError(f"{len(clouds)} clouds but {len(world_from_cam)} poses: give one pose for each cloud")
@@ -66,7 +66,7 @@ def evaluation_pairs(clouds: CloudSet, world_from_cam: Floats, kind: GraphKind, 
 
 
 def _near_centroids(clouds: Iterable[PointCloud], world_from_cam: Floats, some: Ints, scale: float) -> Ints:
-    """Pairs (P, 2) of one of `some` rows and any row."""
+    """Pairs (P, 2) of one of `some` rows and any row whose centroids are near."""
     means = np.array([cloud.points_in_cam.mean(axis=0, dtype=float) for cloud in clouds])
     centroids = np.einsum("nij,nj->ni", world_from_cam[:, :3, :3], means) + world_from_cam[:, :3, 3]
     near = cKDTree(centroids[some]).sparse_distance_matrix(
@@ -76,7 +76,7 @@ def _near_centroids(clouds: Iterable[PointCloud], world_from_cam: Floats, some: 
 
 
 def _overlapping_voxels(clouds: Iterable[PointCloud], world_from_cam: Floats, some: Ints, scale: float) -> Ints:
-    """Pairs (P, 2) of one of `some` rows and any row."""
+    """Pairs (P, 2) of one of `some` rows and any row whose voxels overlap."""
     iou = pairwise_iou(clouds, world_from_cam, scale * IOU_VOXEL_M, above=IOU, partners=some).tocoo()
     return np.stack([iou.row, iou.col], axis=1)
 
@@ -89,12 +89,12 @@ def edge_distances(
     *,
     scale: float = 1.0,
 ) -> Floats:
-    """The distance d (..., P) in metres of each pair, under each set of poses (..., N, 4, 4).
+    """The distance d (..., P) in metres of each pair (P, 2), under each set of poses (..., N, 4, 4).
 
-    `d_ij` is the mean |n·(p − q)| over the points p of cloud j whose nearest neighbour q in cloud i is within 0.1 m, n
-    the normal of cloud i; 0.1 m when there is none, NaN where a pose is not finite. `clouds_folder` is what
-    `CloudSet.save` wrote. Several sets at once share the search trees. The 0.1 m are taken
-    times `scale`. Of many pairs some points of each are measured, evenly strided.
+    `d_ij` is the mean |n·(p − q)| over the points p of cloud j whose nearest neighbour q in cloud i is within 0.1 m
+    times `scale`, n the normal at q; that reach itself where there is none, NaN where a pose is not finite. Several
+    sets at once share the search trees. Of many pairs only some points, evenly strided, are measured. `clouds_folder`
+    is what `CloudSet.save` wrote.
     """
     poses = world_from_cam.reshape(-1, *world_from_cam.shape[-3:])
     distances = np.full((len(poses), len(pairs)), np.nan)
@@ -108,14 +108,15 @@ def edge_distances(
 
 
 def _relative(poses: Floats, pairs: Ints) -> Floats:
+    """Motions i_from_j (S, P, 4, 4) of pairs (P, 2) under sets of poses (S, N, 4, 4)."""
     return np.asarray(se3.inverse(poses[:, pairs[:, 0]]) @ poses[:, pairs[:, 1]])
 
 
 @dataclass(frozen=True)
 class GraphScores:
-    """The scores of every set of poses on one graph: `pairs (P, 2)`, `distances_m (S, P)`, NaN where not defined.
+    """The scores of S sets of poses on one graph: `pairs (P, 2)`, `distances_m (S, P)`, NaN where a pose is unknown.
 
-    `scale`: what σ and the reach of 0.1 m were taken times, for scenes that are no rooms.
+    σ and the reach of 0.1 m are multiplied by `scale`, for scenes that are no rooms.
     """
 
     kind: GraphKind
@@ -150,6 +151,7 @@ class GraphScores:
 
 
 def _mean(values: Floats) -> Floats:
+    """The mean (S,) of the finite values (S, P) of each row; NaN of none."""
     known = np.isfinite(values)
     count = known.sum(axis=1)
     total = np.where(known, values, 0.0).sum(axis=1)
@@ -166,7 +168,7 @@ class ScoreTable:
 
     @property
     def scale(self) -> float:
-        """What the lengths of the scores were taken times."""
+        """The factor on the lengths of the scores."""
         return max((graph.scale for graph in self.graphs), default=1.0)
 
 
@@ -181,9 +183,9 @@ def score_table(
 ) -> ScoreTable:
     """Every set of poses (N, 4, 4), scored on the graphs of the one that `reference` names.
 
-    Of a graph with more than 1500 pairs so many are taken, evenly. Pairs that both graphs share are measured
-    once. Give the ground truth as the reference where there is one, else the result. Lengths are times `scale`, for
-    scenes that are no rooms.
+    The reference is the ground truth where there is one, else the result. Of more than 1500 pairs so many, evenly
+    spread, are scored; pairs of both graphs are measured once. Lengths are multiplied by `scale`, for scenes that are
+    no rooms. Raises `GraphError` for an unknown reference.
     """
     if reference not in pose_sets:
         raise GraphError(f"reference poses {reference!r} are not among {', '.join(pose_sets)}")

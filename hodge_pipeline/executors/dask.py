@@ -26,7 +26,7 @@ def open_workers(executor: Executor, dask: str | None) -> AbstractContextManager
 
 
 def describe(address: str) -> str:
-    """What a cluster has to offer, in one line: workers, hosts, memory, and where its dashboard is.
+    """A cluster's workers, hosts, memory and dashboard, in one line.
 
     Raises `WorkerError` as `cluster_workers` does.
     """
@@ -43,7 +43,7 @@ def describe(address: str) -> str:
 
 @contextmanager
 def cluster_workers(address: str) -> Iterator[Workers]:
-    """The workers of a running cluster, which see the same files under the same paths. It is left as it is.
+    """The workers of a running cluster, which see the same files under the same paths; the cluster goes on after it.
 
     Raises `WorkerError` where the extra is missing, or nothing answers.
     """
@@ -52,6 +52,7 @@ def cluster_workers(address: str) -> Iterator[Workers]:
 
 
 def _client(address: str) -> Any:
+    """A client of the scheduler. Raises `WorkerError` as `cluster_workers` does."""
     try:
         import distributed
     except ImportError as error:
@@ -72,7 +73,7 @@ class ClusterWorkers:
         self._client = client
 
     def map(self, task: Callable[[Task], Result], blocks: Sequence[Task]) -> Iterator[tuple[int, Result]]:
-        """(index, result) of each block as it finishes; the scheduler has a block of a worker that died tried again."""
+        """(index, result) of each block as it finishes; the scheduler retries blocks of workers that died."""
         import distributed
 
         futures = [self._client.submit(task, block, pure=False) for block in blocks]
@@ -85,6 +86,7 @@ class ClusterWorkers:
             self._client.cancel(futures)
 
     def _result(self, future: Any, row: int) -> Any:
+        """The result of a block. Raises `WorkerError` where it lost too many workers."""
         import distributed
 
         try:

@@ -1,4 +1,4 @@
-"""Worker processes on this machine."""
+"""The executor of this machine: spawned worker processes, or none."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class LocalExecutor:
 
     @contextmanager
     def open(self) -> Iterator[Workers]:
-        """Workers that live until the block is left, then end at once; they start with the first task."""
+        """Workers that start with the first task and end at once when the context is left."""
         count = _cores() if self.workers is None else self.workers
         if count == 0:
             yield InProcess()
@@ -58,7 +58,7 @@ class LocalExecutor:
 
 
 class InProcess:
-    """Runs blocks one after the other in this process: for debugging."""
+    """Runs blocks one after the other in this process, for debugging."""
 
     def map(self, task: Callable[[Task], Result], blocks: Sequence[Task]) -> Iterator[tuple[int, Result]]:
         """(index, result) of each block, in order."""
@@ -73,7 +73,10 @@ class SpawnedWorkers:
         self._pool: ProcessPoolExecutor | None = None
 
     def map(self, task: Callable[[Task], Result], blocks: Sequence[Task]) -> Iterator[tuple[int, Result]]:
-        """(index, result) of each block as it finishes; a block of a worker that died is tried again."""
+        """(index, result) of each block as it finishes; blocks of workers that died are retried.
+
+        Raises `WorkerError` for a block that lost too many workers, or a task that workers cannot load.
+        """
         _refuse_main(task, blocks)
         tries = [0] * len(blocks)
         waiting = list(range(len(blocks) - 1, -1, -1))
@@ -82,7 +85,7 @@ class SpawnedWorkers:
             while waiting and self._may_begin(waiting[-1], list(running.values()), tries):
                 try:
                     future = self._submit(task, blocks[waiting[-1]])
-                except BrokenProcessPool:  # a worker died with nothing to do, or a moment ago
+                except BrokenProcessPool:  # an idle worker died, or a busy one that is not noticed yet
                     break
                 running[future] = waiting.pop()
             finished, _ = wait(running, return_when=FIRST_COMPLETED)
@@ -98,10 +101,11 @@ class SpawnedWorkers:
                 waiting += sorted(lost, reverse=True)
 
     def _may_begin(self, row: int, running: list[int], tries: list[int]) -> bool:
-        """Whether to submit: up to two blocks a worker, but one whose worker died alone, to know which block kills."""
+        """Whether to submit a block: up to two for each worker, but a retried one alone, to know which block kills."""
         return not running or (len(running) < 2 * self._count and not any(tries[other] for other in (row, *running)))
 
     def _recover(self, lost: list[int], tries: list[int]) -> None:
+        """Count a try of the lost blocks and drop the pool. Raises `WorkerError` for one that has none left."""
         self.kill()
         for row in lost:
             tries[row] += 1
@@ -112,7 +116,7 @@ class SpawnedWorkers:
                 )
 
     def _submit(self, task: Callable[[Task], Result], block: Task) -> Future[Result]:
-        # a submission may start a process, which takes the environment and the main module as they are now
+        # may start a process, which inherits the environment and the main module as they are now
         with _environment(SINGLE_THREADED), _hidden_main():
             if self._pool is None:
                 spawn = multiprocessing.get_context("spawn")
@@ -133,7 +137,7 @@ class SpawnedWorkers:
 
 
 def _cores() -> int:
-    """Cores that this process may use; macOS and Windows only say how many there are."""
+    """Cores that this process may use; on macOS and Windows all that there are."""
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
@@ -143,9 +147,9 @@ def _begin_worker() -> None:
 
 
 def _end_with_parent() -> None:
-    """End this worker when its parent is killed: workers hold each other's queue open, so they would wait for ever.
+    """End this worker when its parent is killed: workers keep each other's queue open, so they would wait for ever.
 
-    Ctrl-C reaches every process of a terminal: it is the parent's to deal with.
+    Ctrl-C, which reaches every process of a terminal, is left to the parent.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
@@ -169,6 +173,7 @@ def _refuse_main(task: Callable[[Task], Result], blocks: Sequence[Task]) -> None
 
 @contextmanager
 def _environment(values: dict[str, str]) -> Iterator[None]:
+    """Set environment variables while the body runs."""
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:
@@ -183,7 +188,7 @@ def _environment(values: dict[str, str]) -> Iterator[None]:
 
 @contextmanager
 def _hidden_main() -> Iterator[None]:
-    """Keep spawned children from importing the user's script: no guard is needed there, and a notebook works too."""
+    """Keep spawned children from importing the user's script, which then needs no guard; a notebook works too."""
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:

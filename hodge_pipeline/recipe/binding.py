@@ -1,4 +1,4 @@
-"""Plain data to typed options and back: stages by name inside typed sections, every error with its file and line."""
+"""Bind plain data to typed options with stages by name, and back; every error names its file and line."""
 
 from __future__ import annotations
 
@@ -19,17 +19,19 @@ from hodge_pipeline.store.yaml_file import Keys
 
 T = TypeVar("T")
 Where = Callable[[Keys], str]
-"""Gives `file:line` of a key path."""
+"""Gives `file:line` of a path of keys."""
 WORDS = {float: "number", int: "whole number", bool: "true or false", str: "text", type(None): "nothing"}
+"""Types in the words of an error."""
+KIND = "x-stage-kind"
+"""The key that marks a stage of a kind in a schema that is not linked yet."""
 
 
 def bind(cls: type[T], data: Any, where: Where, keys: Keys = (), *, seed: int | None = None) -> T:
-    """An instance of a pydantic dataclass from a mapping; nested sections and stages included.
+    """An instance of a pydantic dataclass from a mapping, with its sections and stages.
 
-    A stage that has an option `seed` and is not given one takes the section's `seed`, so that a recipe's one seed
-    reaches everything random in it.
-
-    Raises `RecipeError`: `file:line: key: what was expected`, with the nearest known name for an unknown key.
+    A stage with an option `seed` that is not given takes the seed of the section around it, so that the one seed of a
+    recipe reaches everything random. Raises `RecipeError`: `file:line: key: what was expected`, with the nearest known
+    name of an unknown key.
     """
     if not isinstance(data, Mapping):
         raise RecipeError(f"{where(keys)}: {_dotted(keys)}: expected a mapping of options, got {data!r}", keys)
@@ -38,7 +40,7 @@ def bind(cls: type[T], data: Any, where: Where, keys: Keys = (), *, seed: int | 
     for key in data:
         if key not in known:
             here = (*keys, key)
-            suggestion = _further_in((*keys, key), data, known) or registry.suggestion(key, list(known))
+            suggestion = _option_of_a_stage((*keys, key), data, known) or registry.suggestion(key, list(known))
             raise RecipeError(f"{where(here)}: {_dotted(here)}: unknown option{suggestion}", here)
     if isinstance(data.get("seed"), int):
         seed = data["seed"]
@@ -51,8 +53,8 @@ def bind(cls: type[T], data: Any, where: Where, keys: Keys = (), *, seed: int | 
         raise _first_error(error, where, keys, known) from error
 
 
-def _further_in(keys: Keys, data: Mapping[str, Any], known: Mapping[str, Any]) -> str:
-    """Where a stage of this section has an option of that name, as a suggestion."""
+def _option_of_a_stage(keys: Keys, data: Mapping[str, Any], known: Mapping[str, Any]) -> str:
+    """A suggestion where a stage of this section has an option of the last key's name; "" where none has."""
     for name, annotation in known.items():
         kind = next(filter(None, map(registry.kind_of, (annotation, *get_args(annotation)))), None)
         stage = data[name].get("stage") if isinstance(data.get(name), Mapping) else data.get(name)
@@ -65,9 +67,9 @@ def _further_in(keys: Keys, data: Mapping[str, Any], known: Mapping[str, Any]) -
 def bind_known(
     cls: type[T], data: dict[str, Any], where: Where, otherwise: dict[str, Any]
 ) -> tuple[T, tuple[str, ...]]:
-    """What `bind` makes of the options that are known here, and why each of the others was left out.
+    """What `bind` makes of the options that this version knows, and the error of each that was left out.
 
-    Sections of which nothing is known are those of `otherwise`, which binds as it is.
+    `otherwise` holds sections to take where nothing of them is left.
     """
     left_out: list[str] = []
     data = {**otherwise, **data}
@@ -82,7 +84,7 @@ def bind_known(
 
 
 def _without(data: Any, keys: Keys) -> Any:
-    """A copy of the data without what stands at the path, or without the last part of the path that is there."""
+    """A copy of the data without what is at the path of keys, or at the longest part of it that exists."""
     head, rest = keys[0], keys[1:]
     copy = data.copy()
     inside = data[head]
@@ -116,8 +118,9 @@ def _value(annotation: Any, value: Any, where: Where, keys: Keys, seed: int | No
 
 
 def _number(types_: tuple[Any, ...], value: Any, where: Where, keys: Keys) -> Any:
-    """The value of an option of one of these types, unless it is a truth value for a number, which pydantic takes for
-    1 or 0, or has no end where the option is no limit.
+    """The value of an option of these types. Raises `RecipeError` for what pydantic takes for a number but is none.
+
+    That is a truth value, and infinity unless the option is a limit.
     """
     is_number = bool({int, float} & set(types_))
     is_limit = str(keys[-1]).startswith("max_") or "limit" in str(keys[-1])
@@ -127,7 +130,7 @@ def _number(types_: tuple[Any, ...], value: Any, where: Where, keys: Keys) -> An
 
 
 def bind_stage(kind: str, value: Any, where: Where, keys: Keys, seed: int | None = None) -> Any:
-    """The stage that `{stage: name, option: …}`, or the name alone, stands for."""
+    """The stage of `{stage: name, option: …}` or of a name alone. Raises `RecipeError` as `bind`."""
     options = {"stage": value} if isinstance(value, str) else value
     if not isinstance(options, Mapping) or not isinstance(options.get("stage"), str):
         known = ", ".join(registry.names(kind))
@@ -140,8 +143,9 @@ def bind_stage(kind: str, value: Any, where: Where, keys: Keys, seed: int | None
 
 
 def stage_of(kind: str, given: Any, options: Mapping[str, Any], where: str) -> Any:
-    """The stage that a caller in Python gives, by name with options or as it is; errors (`RecipeError`) begin with
-    `where`.
+    """The stage that a caller in Python gave: a name with options, or the stage itself.
+
+    Raises `RecipeError`, which begins with `where`.
     """
     if isinstance(given, str):
         return bind_stage(kind, {**options, "stage": given}, lambda keys: where, (kind,))
@@ -153,7 +157,7 @@ def stage_of(kind: str, given: Any, options: Mapping[str, Any], where: str) -> A
 
 
 def unbind(value: Any) -> Any:
-    """Options as plain data that `bind` reads back: every default written out, a stage as `{stage: name, …}`."""
+    """Options as plain data that `bind` reads back, with every default; a stage as `{stage: name, …}`."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {field.name: unbind(getattr(value, field.name)) for field in dataclasses.fields(value)}
         return {"stage": registry.name_of(value), **fields} if _is_stage(value) else fields
@@ -165,7 +169,7 @@ def unbind(value: Any) -> Any:
 
 
 def _is_stage(value: Any) -> bool:
-    """Whether it has the methods of a kind of stage; an option that is only called like one does not count."""
+    """Whether it has the methods of a kind of stage; data that only have the names of methods are none."""
     protocols = [kind.protocol for kind in registry.KINDS.values() if isinstance(value, kind.protocol)]
     return any(
         all(callable(getattr(value, name)) for name in vars(protocol) if not name.startswith("_"))
@@ -194,7 +198,7 @@ def _dotted(keys: Keys) -> str:
 
 
 def _first_error(error: ValidationError, where: Where, keys: Keys, known: Mapping[str, Any]) -> RecipeError:
-    """The first of pydantic's complaints as one line at its own key; of an option of several types, what they are."""
+    """The first of pydantic's errors as one line with its key; of an option of several types, these types."""
     first = error.errors()[0]
     field = first["loc"][0] if first["loc"] else None
     if isinstance(field, str) and len({other["loc"][1:2] for other in error.errors() if other["loc"][0] == field}) > 1:
@@ -209,19 +213,16 @@ def _first_error(error: ValidationError, where: Where, keys: Keys, known: Mappin
     return RecipeError(f"{where(here)}: {_dotted(here)}: {what.rstrip('.')}, got {first['input']!r}", here)
 
 
-KIND = "x-stage-kind"
-
-
 class _StageSchema(GenerateJsonSchema):
-    """JSON schema in which a field typed by a stage Protocol is marked with that kind, and a stage may say its name."""
+    """Makes JSON schemas in which a field typed by a stage's Protocol is marked with the kind of stage."""
 
     def is_instance_schema(self, schema: Any) -> JsonSchemaValue:
-        """A mark in place of the kind; `_linked` makes a reference of it once pydantic has checked its own."""
+        """A mark of the kind, of which `_linked` makes a reference, since pydantic refuses those of others."""
         kind = registry.kind_of(schema["cls"])
         return {KIND: kind.name} if kind else super().is_instance_schema(schema)
 
     def dataclass_schema(self, schema: Any) -> JsonSchemaValue:
-        """An option that takes one stage alone: `stage: name` may stand among its options, as `bind` reads it."""
+        """The schema of a section, in which `stage: name` may stand where the section is a stage, as `bind` allows."""
         found, name = super().dataclass_schema(schema), registry.name_of_class(schema["cls"])
         if ":" not in name:
             found["properties"] = {"stage": {"const": name}, **found.get("properties", {})}
@@ -229,7 +230,7 @@ class _StageSchema(GenerateJsonSchema):
 
 
 def json_schema(cls: type) -> dict[str, Any]:
-    """JSON schema (draft 2020-12) of a recipe with every installed stage, for editors; a broken plugin is left out."""
+    """The JSON schema (draft 2020-12) of a recipe with all installed stages, for editors; without broken plugins."""
     schema: dict[str, Any] = TypeAdapter(cls).json_schema(schema_generator=_StageSchema)
     definitions = schema.setdefault("$defs", {})
     for kind in registry.KINDS:
@@ -244,6 +245,7 @@ def json_schema(cls: type) -> dict[str, Any]:
 
 
 def _stage_schema(kind: str, name: str, definitions: dict[str, Any]) -> dict[str, Any]:
+    """The schema of a stage, its name alone or with options; its sections are added to the definitions."""
     stage = TypeAdapter(registry.load(kind, name)).json_schema(schema_generator=_StageSchema)
     definitions.update(stage.pop("$defs", {}))
     stage["properties"] = {**stage.get("properties", {}), "stage": {"const": name}}
@@ -252,7 +254,7 @@ def _stage_schema(kind: str, name: str, definitions: dict[str, Any]) -> dict[str
 
 
 def _linked(node: Any) -> Any:
-    """The schema with each mark as a reference to the definition of its kind."""
+    """The schema with a reference to the definition of the kind in place of each mark."""
     if isinstance(node, list):
         return [_linked(item) for item in node]
     if not isinstance(node, dict):

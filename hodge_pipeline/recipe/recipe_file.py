@@ -12,10 +12,11 @@ from hodge_pipeline.store import yaml_file
 from hodge_pipeline.store.yaml_file import Document, Keys
 
 MAX_EXTENDS = 8
+"""Recipes in a chain of `extends`: a longer one is a cycle."""
 
 
 def recipe_folder() -> Path:
-    """Where the recipes of this package lie: inside it when it was installed from a wheel, else in the checkout."""
+    """The folder of this package's recipes: inside it when installed from a wheel, else in the checkout."""
     package = Path(__file__).parents[1]
     inside = package / "recipes"
     return inside if inside.is_dir() else package.parent / "recipes"
@@ -27,7 +28,10 @@ def recipe_names() -> list[str]:
 
 
 def find(name_or_path: str, beside: Path | None = None) -> Path:
-    """The file of a recipe: a path (relative to `beside`, for `extends`), or the name of one that is installed."""
+    """The file of a recipe: a path, first relative to `beside`, or the name of an installed one.
+
+    Raises `RecipeError` where there is none.
+    """
     path = Path(name_or_path)
     if path.suffix in (".yaml", ".yml"):
         found = [base for base in ((beside or Path()) / path, path) if base.is_file()]
@@ -43,7 +47,10 @@ def find(name_or_path: str, beside: Path | None = None) -> Path:
 
 
 def load(name_or_path: str, overrides: Sequence[str] = ()) -> Document:
-    """The plain data of a recipe with everything that it extends, and the overrides (`a.b=value`) on top."""
+    """The plain data of a recipe, over those that it extends, with overrides (`a.b=value`) on top.
+
+    Raises `RecipeError` with the file and line, or the override, that is wrong.
+    """
     document = _extended(find(name_or_path), depth=0)
     for override in overrides:
         document = _overridden(document, override)
@@ -52,7 +59,7 @@ def load(name_or_path: str, overrides: Sequence[str] = ()) -> Document:
 
 
 def _refuse_cluster(document: Document) -> None:
-    """Recipes come from anybody, and who answers at the address of a cluster runs code here: no recipe names one."""
+    """Raise `RecipeError` where a recipe, which anybody may write, names a cluster: a scheduler runs code here."""
     executor = document.data.get("executor")
     options = executor if isinstance(executor, dict) else {"stage": executor}
     named = "address" if "address" in options else "stage" if options.get("stage") == "dask" else None
@@ -78,12 +85,12 @@ def _extended(path: Path, depth: int) -> Document:
     except RecipeError as error:
         raise error if ":" in str(error).split(" ")[0] else RecipeError(f"{where}: extends: {error}") from error
     merged = _merged(base.data, document.data)
-    inherited = {keys: line for keys, line in base.origins.items() if _stands(merged, keys)}
+    inherited = {keys: line for keys, line in base.origins.items() if _exists(merged, keys)}
     return Document(merged, {**inherited, **document.origins})
 
 
-def _stands(data: Any, keys: Keys) -> bool:
-    """Whether the path leads somewhere: not into what another recipe replaced."""
+def _exists(data: Any, keys: Keys) -> bool:
+    """Whether the data have a value at this path of keys."""
     try:
         for key in keys:
             data = data[key]
@@ -93,7 +100,7 @@ def _stands(data: Any, keys: Keys) -> bool:
 
 
 def _merged(base: Any, over: Any) -> Any:
-    """Mappings merge key by key, anything else is replaced; so are the options of a stage that another replaces."""
+    """`over` merged over `base`: mappings key by key, anything else replaced; another stage takes no options over."""
     over_stage = over.get("stage") if isinstance(over, dict) else None
     if isinstance(base, str) and over_stage is None and isinstance(over, dict):
         base = {"stage": base}
@@ -105,7 +112,7 @@ def _merged(base: Any, over: Any) -> Any:
 
 
 def _overridden(document: Document, override: str) -> Document:
-    """The document with one `a.b=value`; a number in the path is a row of a list."""
+    """The document with one override `a.b=value`; a number in the path is a row of a list."""
     name = f"--set {override}"
     path, equals, text = override.partition("=")
     keys = path.strip().split(".")
@@ -125,7 +132,7 @@ def _typed(keys: list[str]) -> Keys:
 
 
 def _nested(data: Any, keys: list[str], value: Any, name: str) -> Any:
-    """A copy of the data in which the value stands at the path."""
+    """A copy of the data with the value at the path of keys. Raises `RecipeError` where the path cannot be."""
     if not keys:
         return _merged(data, value) if isinstance(value, dict) else value
     head, rest = keys[0], keys[1:]

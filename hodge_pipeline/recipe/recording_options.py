@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 Level = Literal["off", "summary", "normal", "full"]
 
 SHARES = {"images": 0.85, "clouds": 0.04, "model": 0.07, "solver": 0.04}
-"""How the stages divide `max_megabytes`: fixed, so that no stage's part depends on which others are there."""
+"""Shares of the stages in `max_megabytes`: fixed, so that the part of one does not depend on the others."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -39,7 +39,7 @@ class RecordingOptions:
         return int(SHARES[stage] * self.max_megabytes * 1e6)
 
     def count(self, wished: int, available: int, bytes_each: float, max_bytes: float) -> int:
-        """How many of the available items to keep: the wish counts up to level `normal`, the bytes always."""
+        """How many of the available items to keep: as wished, of level `full` all, and always within the bytes."""
         kept = available if self.level == "full" else min(available, wished)
         return min(kept, int(max_bytes // bytes_each))
 

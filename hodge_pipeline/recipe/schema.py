@@ -22,15 +22,7 @@ from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.pairs import Acceptance
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.sources.measured_edges import MeasuredOptions
-from hodge_pipeline.stages import (
-    ConsistencySolver,
-    EdgeBuilder,
-    Executor,
-    FrameReader,
-    Fuser,
-    Registrar,
-    Start,
-)
+from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Executor, FrameReader, Fuser, Registrar, Start
 from hodge_pipeline.start.key_frames import KeyFrameStart
 from hodge_pipeline.start.known_positions import PositionOptions
 from hodge_pipeline.store import yaml_file
@@ -117,8 +109,8 @@ REQUIRED = ("edges", "registration", "solver", "executor")
 def load_recipe(name_or_path: str, overrides: Sequence[str] = (), source: Path | None = None) -> Recipe:
     """The recipe of a name or file, with overrides such as `solver.inner_iterations=5` and another source.
 
-    Options of a reader that nothing names are those of the source's surest one. Raises `RecipeError`: `file:line: key:
-    what was expected`.
+    Options of a reader without a name are bound to the reader that is surest of the source. Raises `RecipeError`:
+    `file:line: key: what was expected`.
     """
     document = recipe_file.load(name_or_path, overrides)
     if "model" in document.data:
@@ -128,7 +120,7 @@ def load_recipe(name_or_path: str, overrides: Sequence[str] = (), source: Path |
 
 
 def _with_reader(data: dict[str, Any], source: Path | None) -> dict[str, Any]:
-    """The recipe's data in which a reader with options alone is the surest of the source."""
+    """The recipe's data in which a reader with options but no name is the one that is surest of the source."""
     section = data.get("source")
     if not isinstance(section, dict):
         return data
@@ -140,10 +132,10 @@ def _with_reader(data: dict[str, Any], source: Path | None) -> dict[str, Any]:
 
 
 def recipe_of_run(path: Path) -> tuple[Recipe, tuple[str, ...]]:
-    """The recipe that a run was made by, as far as this version knows its options, and why others were left out.
+    """The recipe of a run, as far as this version knows its options, and why each other option was left out.
 
-    It is for looking at the run: `load_recipe`, which runs it again, refuses it. Stages that are required and unknown
-    here are those of the recipe `tum`. Raises `RecipeError` where the file is no YAML.
+    It serves to show the run; `load_recipe`, which runs it again, refuses unknown options. Unknown stages that are
+    required become those of the recipe `tum`. Raises `RecipeError` where the file is no YAML.
     """
     document = yaml_file.read(path)
     basic = {key: value for key, value in recipe_file.load("tum").data.items() if key in REQUIRED}
@@ -151,5 +143,5 @@ def recipe_of_run(path: Path) -> tuple[Recipe, tuple[str, ...]]:
 
 
 def with_source(recipe: Recipe, path: Path) -> Recipe:
-    """The recipe on another source."""
+    """The recipe with another path of its source."""
     return dataclasses.replace(recipe, source=dataclasses.replace(recipe.source, path=path))

@@ -1,1 +1,1 @@
-"""Poses that another program made, made better: by loops, registration and a consistent solve, under a guard."""
+"""Refine the poses of another program (trajectory, COLMAP model, pose graph); a guard never keeps a worse result."""

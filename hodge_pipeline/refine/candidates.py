@@ -1,4 +1,4 @@
-"""The candidates of a refined model: what bundle adjustment makes of each way to start it."""
+"""The candidates of a refined model: bundle adjustment from each of several initial poses."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ RESECTED = "resection and bundle adjustment"
 ROBUST, ROBUST_POINTS = "resection and robust bundle adjustment", "robust bundle adjustment of points alone"
 AFTER_ROBUST = "bundle adjustment without a robust loss from there"
 CONSISTENT, MENDED = "consistent poses and bundle adjustment", "images that are off placed anew and bundle adjustment"
-MENDINGS = 3
-"""Rounds: an image placed anew gives its neighbours points to be placed by."""
+MOST_RESECTIONS = 3
+"""Rounds of resecting doubtful images: one that is placed well gives points that its neighbours are placed by."""
 NO_EDGE = "no edge was found: no two images share enough points, matches or depth (model.min_shared)"
 NO_EDGE_LEFT = "every edge was rejected: no two of them agree"
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A model that might be kept, under the name by which a report calls it; `holds_poses`: those of the input."""
+class CandidateModel:
+    """A bundle-adjusted model, and how the report names the way it was made; `holds_poses`: it has the input's."""
 
     name: str
     model: TrackedModel
@@ -39,22 +39,22 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Found:
-    """The candidates in the order in which they were made, the joined input first, and what each costs.
+class CandidateSet:
+    """K candidates in the order in which they were made, the joined input in row 0, with the cost of each.
 
-    `inputs` is the cost of the input models, each in its own gauge. The consistent solve is None where it was not
-    needed, or nothing was measured.
+    `inputs` is the cost of the input models, each in its own gauge. `solved`, the consistent solve, is None where it
+    was not needed or no edge was measured.
     """
 
     inputs: Cost
-    candidates: Sequence[Candidate]
+    candidates: Sequence[CandidateModel]
     costs: Sequence[Cost]
     solved: Solved | None
     depth: DepthEdges
     notes: tuple[str, ...]
 
     @property
-    def positions_off(self) -> Floats:
+    def position_errors_m(self) -> Floats:
         """The median distance (K,) of each candidate's bodies from their known positions; NaN without any."""
         known = self.candidates[0].model.known_positions
         if known is None:
@@ -72,32 +72,35 @@ class Found:
         return self.costs[row].px
 
     @property
-    def held(self) -> int:
-        """The row of the candidate with the input's poses that has the lowest cost."""
+    def best_held(self) -> int:
+        """The row of the lowest cost among the candidates that have the input's poses."""
         return min((row for row, one in enumerate(self.candidates) if one.holds_poses), key=self.px)
 
 
-class _Weighing:
-    """The candidates so far; each new one is a step, and one whose adjustment fails is a note."""
+class _Candidates:
+    """The candidates so far and their costs, which change with every new one: all are measured on one scale."""
 
     def __init__(self, inputs: Sequence[TrackedModel], start: TrackedModel, steps: Steps) -> None:
         self._inputs, self._steps = [model.quality for model in inputs], steps
-        self.candidates, self.notes = [Candidate(GIVEN, start, holds_poses=True)], list[str]()
+        self.candidates, self.notes = [CandidateModel(GIVEN, start, holds_poses=True)], list[str]()
         self._known = start.known_positions
-        self.update()
+        self.update_costs()
 
-    def update(self) -> None:
+    def update_costs(self) -> None:
+        """Measure the inputs and all candidates again."""
         self.inputs, *self.costs = costs(self._inputs, [one.model.quality for one in self.candidates])
 
     @property
     def best(self) -> int:
+        """The row of the candidate with the lowest cost."""
         return best(self.costs)
 
     @property
     def is_settled(self) -> bool:
-        """Whether nothing is left to explain, or two ways came to one optimum."""
+        """Whether the best is sound, or two that began at different poses reached one optimum that leaves no image off."""
         lowest = self.costs[self.best]
-        same = [cost for cost in self.costs[1:] if cost.px <= (1 + SAME_COST) * lowest.px]
+        rows = [row for row, one in enumerate(self.candidates) if not one.holds_poses and one.name != REPLACED]
+        same = [row for row in rows if self.costs[row].px <= (1 + SAME_COST) * lowest.px]
         return lowest.is_sound or (len(same) > 1 and not lowest.images_off)
 
     def add(
@@ -109,6 +112,9 @@ class _Weighing:
         *,
         move_bodies: bool = True,
     ) -> None:
+        """Adjust a model, as a step, from its own poses or from these (B, 4, 4), which `move_bodies` may hold; a failure
+        becomes a note.
+        """
         try:
             found = self._steps.step(adjusted_model, model, poses, priors or self._known, move_bodies, title=name)
         except SourceError as error:
@@ -116,86 +122,93 @@ class _Weighing:
             return
         adjusted = model.read_back(found.folder, found.notes)
         self._steps.remember(adjusted, self._steps.key(found))
-        self.candidates.append(Candidate(name, adjusted, holds_poses=not move_bodies))
-        self.update()
+        self.candidates.append(CandidateModel(name, adjusted, holds_poses=not move_bodies))
+        self.update_costs()
 
 
-def weigh(
+def make_candidates(
     inputs: Sequence[TrackedModel],
     start: TrackedModel,
     options: ModelRefinement,
     steps: Steps,
     workers: Workers,
     is_metric: bool,
-) -> Found:
-    """Make candidates, the cheapest first, until nothing is left that another could explain.
+) -> CandidateSet:
+    """Candidates from the cheapest way to start to the dearest, until the best one leaves nothing to explain.
 
-    Depth takes part where the model is in metres: else its clouds are in another unit, or not of these images.
+    Depth takes part only where the model is in metres: without a scale its clouds do not fit the model's unit.
     """
-    weighing, plain, plainly = _Weighing(inputs, start, steps), start, 0
-    weighing.add(POINTS, start, start.world_from_body, move_bodies=False)
-    weighing.add(ADJUSTED, start)
-    if not weighing.costs[0].is_sound:
-        weighing.add(REPLACED, start, start.world_from_body)
+    found, model, first_robust = _Candidates(inputs, start, steps), start, 0
+    found.add(POINTS, start, start.world_from_body, move_bodies=False)
+    found.add(ADJUSTED, start)
+    if not found.costs[0].is_sound:
+        found.add(REPLACED, start, start.world_from_body)
         poses = steps.step(resected_poses, start, None, title="resection").poses
-        weighing.add(RESECTED, start, poses)
-        if not weighing.costs[weighing.best].is_sound:
-            plainly = len(weighing.candidates)
-            key, start = steps.key([start, ROBUST]), start.with_robust_loss()
-            steps.remember(start, key)
-            weighing.add(ROBUST_POINTS, start, start.world_from_body, move_bodies=False)
-            weighing.add(ROBUST, start, poses)
-    depth = depth_edges(start, options, steps, workers) if is_metric else no_depth_edges(start)
+        found.add(RESECTED, start, poses)
+        if not found.costs[found.best].is_sound:
+            first_robust = len(found.candidates)
+            key, model = steps.key([start, ROBUST]), start.with_robust_loss()
+            steps.remember(model, key)
+            found.add(ROBUST_POINTS, model, start.world_from_body, move_bodies=False)
+            found.add(ROBUST, model, poses)
+    depth = depth_edges(model, options, steps, workers) if is_metric else no_depth_edges(model)
     solved = None
-    if not weighing.is_settled or start.held_apart or depth.graph.edge_count:
-        solved = _consistent(weighing, start, depth, options, steps)
-    _mend(weighing, steps)
-    if start is not plain:
-        weighing.add(AFTER_ROBUST, plain, weighing.candidates[weighing.best].model.world_from_body)
-        added = weighing.candidates[-1].name == AFTER_ROBUST
-        if added and weighing.costs[-1].is_sound:  # the tracks were right: all of what they say counts
-            weighing.candidates[plainly:-1] = []
-            weighing.update()
-    notes = (*depth.notes, *weighing.notes)
-    return Found(weighing.inputs, weighing.candidates, weighing.costs, solved, depth, notes)
+    if not found.is_settled or model.held_apart or depth.graph.edge_count:
+        solved = _add_consistent(found, model, depth, options, steps)
+    _add_resected(found, steps)
+    if model is not start:
+        _add_without_robust_loss(found, start, first_robust)
+    return CandidateSet(found.inputs, found.candidates, found.costs, solved, depth, (*depth.notes, *found.notes))
 
 
-def _consistent(
-    weighing: _Weighing, start: TrackedModel, depth: DepthEdges, options: ModelRefinement, steps: Steps
+def _add_consistent(
+    found: _Candidates, model: TrackedModel, depth: DepthEdges, options: ModelRefinement, steps: Steps
 ) -> Solved | None:
-    """The solve of all edges, whose poses become a candidate."""
-    measured, left_out = steps.step(measured_edges, start, title="edges")
-    weighing.notes += left_out
+    """Solve the graph of all edges, and add the candidate that starts from its poses; None without an edge."""
+    measured, left_out = steps.step(measured_edges, model, title="edges")
+    found.notes += left_out
     graph = ViewGraph.joined([measured, depth.graph])
     if not graph.edge_count:
-        weighing.notes.append(NO_EDGE)
+        found.notes.append(NO_EDGE)
         return None
-    solved = solve_bodies(graph, start.world_from_body, options.solver)
-    weighing.notes += solved.solution.notes
+    solved = solve_bodies(graph, model.world_from_body, options.solver)
+    found.notes += solved.solution.notes
     if not solved.kept.any():
-        weighing.notes.append(NO_EDGE_LEFT)
+        found.notes.append(NO_EDGE_LEFT)
         return solved
     with_depth = bool((solved.kept & (solved.graph.source == "depth")).any())
     priors = position_priors(solved) if with_depth else None
-    weighing.add(CONSISTENT, start, solved.solution.world_from_cam, priors)
+    found.add(CONSISTENT, model, solved.solution.world_from_cam, priors)
     return solved
 
 
-def _mend(weighing: _Weighing, steps: Steps) -> None:
-    """The best so far, with the images that are off placed anew by the points that the others hold."""
-    for _ in range(MENDINGS):
-        at = weighing.best
-        off = weighing.costs[at].images_in_doubt if at else ()
-        if not off:
+def _add_resected(found: _Candidates, steps: Steps) -> None:
+    """Add the best candidate with its doubtful images resected from the points of the others, while that is better."""
+    for _ in range(MOST_RESECTIONS):
+        at = found.best
+        doubtful = found.costs[at].images_in_doubt if at else ()
+        if not doubtful:
             return
-        model = weighing.candidates[at].model
+        model = found.candidates[at].model
         names = np.array([str(frame.frame_id) for frame in model.frames])
         bodies = np.zeros(len(model.body_names), bool)
-        bodies[model.body_of_frame[np.isin(names, off)]] = True
+        bodies[model.body_of_frame[np.isin(names, doubtful)]] = True
         poses = steps.step(resected_poses, model, bodies, title="resection").poses
-        weighing.add(MENDED, model, poses)
-        if weighing.best == at:
+        found.add(MENDED, model, poses)
+        if found.best == at:
             return
+
+
+def _add_without_robust_loss(found: _Candidates, start: TrackedModel, first_robust: int) -> None:
+    """Adjust the best poses with the squared loss; where that is sound it replaces the robust candidates.
+
+    A sound result shows that the tracks are right, so a loss that discounts them only loses accuracy.
+    """
+    found.add(AFTER_ROBUST, start, found.candidates[found.best].model.world_from_body)
+    added = found.candidates[-1].name == AFTER_ROBUST
+    if added and found.costs[-1].is_sound:
+        found.candidates[first_robust:-1] = []
+        found.update_costs()
 
 
 @dataclass(frozen=True)
@@ -206,18 +219,18 @@ class BodyPoses:
 
 
 def resected_poses(model: TrackedModel, bodies: Bools | None, *, step: Step) -> BodyPoses:
-    """Step: where the points put these bodies."""
+    """Step: the poses of the model with these bodies (B,) placed by resection from its points; None: all of them."""
     return BodyPoses(model.resected(bodies))
 
 
 def measured_edges(model: TrackedModel, *, step: Step) -> tuple[ViewGraph, tuple[str, ...]]:
-    """Step: the model's edges from what its images share, and what was left out."""
+    """Step: the model's relative motions by two-view geometry, and a note on each kind of pair left out."""
     return model.measured()
 
 
 @dataclass(frozen=True)
 class AdjustedModel:
-    """A folder with what bundle adjustment wrote, and remarks."""
+    """The folder of a model that bundle adjustment wrote, and its notes."""
 
     folder: Path
     notes: tuple[str, ...]
@@ -226,10 +239,10 @@ class AdjustedModel:
 def adjusted_model(
     start: TrackedModel, poses: Floats | None, priors: PositionPriors | None, move_bodies: bool = True, *, step: Step
 ) -> AdjustedModel:
-    """Step: the bundle adjustment from the model's own poses or from these, with points that a match calls one merged.
+    """Step: bundle adjustment from the model's own poses, or from these (B, 4, 4) with matched points merged.
 
-    What it brings together can be merged after it, and is then adjusted once more. Where bodies are not to move, points
-    alone are adjusted, and none is merged.
+    Adjustment brings more matched points together: these are merged after it, and adjusted once more. With poses held,
+    by `move_bodies`, none is merged. Raises `SourceError` where it fails.
     """
     if poses is not None and not move_bodies:
         return _written(start.moved(poses).adjusted(priors, move_bodies=False), step)

@@ -1,4 +1,4 @@
-"""Whether the tracks of a model contradict its intrinsics, which are held."""
+"""Whether the tracks of a model contradict its intrinsics, which bundle adjustment holds."""
 
 from __future__ import annotations
 
@@ -6,32 +6,33 @@ from typing import Literal
 
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.difference import alike
-from hodge_pipeline.refine.candidates import Found, adjusted_model
-from hodge_pipeline.refine.judge import costs
+from hodge_pipeline.refine.candidates import CandidateSet, adjusted_model
+from hodge_pipeline.refine.judge import costs, degrees_of_freedom
 from hodge_pipeline.stages import Steps, TrackedModel
 
 FREE: dict[Literal["focal", "all"], tuple[str, float]] = {
     "focal": ("bundle adjustment with free focal lengths", 0.05),
     "all": ("bundle adjustment with free intrinsics", 0.2),
 }
-"""What is freed, and the least gain that contradicts it, of the mean error: less is a lens that does not quite fit. Where
-a focal length is 3 % off 15 % are gained in lund_door and 43 % in a rendered room; in models as COLMAP leaves them
-nothing is. COLMAP holds principal points, so that freeing them gains a few per cent in any model.
+"""What is freed, and the share of the mean error that this must save: a lens model that fits badly causes less. A focal
+length that is 3 % off causes 15 % in lund_door and 43 % in a rendered room; models as COLMAP leaves them gain nothing.
+Principal points, which COLMAP holds, gain a few per cent in any model.
 """
-LEAST_LEFT = 10
-"""Numbers to an image that observations have beyond what points and poses take: of fewer anything fits better."""
+LEAST_FREEDOM = 10
+"""Degrees of freedom to an image: with fewer any further parameter fits better."""
 
 
-def intrinsics_doubt(found: Found, steps: Steps) -> str:
-    """Why poses may be wrong where the best candidate that moves them fits much better with free intrinsics; empty where
-    it does not, where these are refined anyway, and where the input's poses fit much better than any moved ones.
+def intrinsics_doubt(found: CandidateSet, steps: Steps) -> str:
+    """Why a model is in doubt: its best candidate that moves poses fits much better with free intrinsics.
+
+    "" where it does not, where too few observations tell, where intrinsics are refined anyway, and where the input's
+    poses fit better than any that were moved.
     """
     at = min((row for row, one in enumerate(found.candidates) if not one.holds_poses), default=0, key=found.px)
     model = found.candidates[at].model
-    left = 2 * len(model.quality.errors_px) - 3 * model.quality.points - 6 * len(model.body_names)
-    if not at or model.moves_intrinsics or left < LEAST_LEFT * model.quality.images:
+    if not at or model.moves_intrinsics or degrees_of_freedom(model) < LEAST_FREEDOM * model.quality.images:
         return ""
-    if not (1 - FREE["focal"][1]) * found.px(at) <= found.px(found.best):
+    if (1 - FREE["focal"][1]) * found.px(at) > found.px(found.best):
         return ""
     doubt, least = "", 1.0
     for what, (title, gain) in FREE.items():
@@ -39,9 +40,8 @@ def intrinsics_doubt(found: Found, steps: Steps) -> str:
         if free is None:
             continue
         held, freed = costs([model.quality], [model.quality, free.quality])[1:]
-        if freed.px <= (1 - gain) * held.px and freed.px <= (1 - gain) * least * held.px:
-            least = freed.px / held.px
-            error = f"mean error {' → '.join(alike(held.px, freed.px, 3))} px"
+        if freed.px <= (1 - gain) * least * held.px:
+            least, error = freed.px / held.px, f"mean error {' → '.join(alike(held.px, freed.px, 3))} px"
             told = ", ".join((*free.notes, error))
             doubt = f"in doubt, since tracks contradict the intrinsics ({told}): --refine {what}"
     return doubt

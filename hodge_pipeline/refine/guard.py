@@ -1,4 +1,4 @@
-"""The guard of every refinement: by its own measures the result is better, as good, or worse; worse is never kept."""
+"""The guard of every refinement: a result that is worse than its input by its own measures is never kept."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Literal, TypeAlias
 
 from hodge_pipeline.evaluation.difference import Better, alike, sign_of
 
+SCORE_TOLERANCE = 0.002
+"""Least tolerance of a score exp(−d/σ), σ = 69 mm: what 0.14 mm of distance between clouds make."""
 Outcome: TypeAlias = Literal["refined", "optimal", "worse", "forced", "nothing"]
 
 
@@ -15,9 +17,8 @@ Outcome: TypeAlias = Literal["refined", "optimal", "worse", "forced", "nothing"]
 class Measure:
     """One quality of the poses, before and after.
 
-    `better` says which way is good; a change the other way by more than `tolerance`, in the measure's own unit, is a
-    change for the worse: what the measure's own noise could do is none. `is_held_out`: of measurements that took no
-    part in the solve.
+    `better` says which way is good; a change the other way counts beyond `tolerance`, the measure's own noise in its
+    own unit. `is_held_out`: it is of measurements that took no part in the solve.
     """
 
     name: str
@@ -48,8 +49,11 @@ class Measure:
 
 
 @dataclass(frozen=True)
-class Change:
-    """How far the poses moved, and how well the measurements fix them: root mean squares over the poses."""
+class PoseChange:
+    """How far the poses moved, and how well the measurements fix them: root mean squares over the poses.
+
+    The uncertainties are two standard deviations, NaN where the measurements do not tell.
+    """
 
     translation_m: float
     rotation_deg: float
@@ -78,21 +82,21 @@ class Change:
 
 @dataclass(frozen=True)
 class Decision:
-    """What becomes of a refinement, why, and the measures behind it.
+    """What becomes of a refinement, why, and the measures that decided.
 
     - `refined`: the result is written;
-    - `optimal`: what was held out fits the input as well (poses that move by more than their uncertainty need a gain of
-      one standard error, others of three), or, where nothing was, it differs from the input by less than
-      its own uncertainty: the input is given back;
-    - `worse`: the result fails a measure of its own: the input is given back, and the exit code is 3;
-    - `forced`: as `worse`, but the result is written all the same;
-    - `nothing`: no measurement related the poses: nothing is written but the report, and the exit code is 3.
+    - `optimal`: the input is given back, since it fits what was held out as well (poses that moved by more than their
+      uncertainty must gain one standard error, others three); or, with nothing held out, since no pose moved by more
+      than its uncertainty;
+    - `worse`: the input is given back, since the result fails a measure; exit code 3;
+    - `forced`: as `worse`, but the result is written;
+    - `nothing`: only the report is written, since no measurement relates the poses; exit code 3.
     """
 
     outcome: Outcome
     reason: str
     measures: tuple[Measure, ...] = ()
-    change: Change | None = None
+    change: PoseChange | None = None
     doubt: str = ""
     """Why even what is kept may be wrong."""
 
@@ -107,11 +111,11 @@ class Decision:
         return 3 if self.outcome in ("worse", "nothing") else 0
 
 
-def decide(measures: Sequence[Measure], change: Change | None = None, *, force: bool = False) -> Decision:
+def decide(measures: Sequence[Measure], change: PoseChange | None = None, *, force: bool = False) -> Decision:
     """The decision on a refinement. With `force` a worse result is written; an optimal input is still given back.
 
-    Measurements held out come before the uncertainty, which is that of edges which hardly fix the poses, or state too
-    little. Where the result fits its own edges better, and those held out no better, the input is as good as they tell.
+    Measurements held out come before the uncertainty, which weak or overconfident edges state wrongly. A result that is
+    worse by held-out measures alone is no failure: the input is `optimal` by them.
     """
     measures = tuple(measures)
     worse = [measure for measure in measures if measure.is_worse]

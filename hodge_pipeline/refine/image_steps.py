@@ -1,7 +1,7 @@
-"""What images say of poses: how far the steps between frames lie from those that corners, followed, show.
+"""Poses tested by optical flow: how far steps between frames lie from those that corners, tracked, show.
 
-Depth takes part in it by the parallax alone: depth that is 5 % off makes a step 5 % longer or shorter. Surfaces that a
-sensor warps alike in every frame can fit each other best where no camera was.
+It is a test apart from the clouds, which a sensor may warp alike in every frame: they then fit each other best at wrong
+poses. Depth enters by the parallax alone, so depth that is 5 % off makes a step 5 % longer or shorter.
 """
 
 from __future__ import annotations
@@ -17,21 +17,22 @@ from hodge_pipeline.stages import Step
 from hodge_pipeline.types import Floats, Frame, Ints, Source
 
 MOST_STEPS = 100
-"""Evenly over the sequence: 30 ms each at 640x480."""
+"""Steps that are tested, evenly over the sequence: 30 ms each at 640x480."""
 RANGE_M = (0.1, 100.0)
-"""Of depth that counts, metres in a room."""
+"""Depth that counts, in units of the recipe's scale."""
 
 
 @dataclass(frozen=True)
 class StepErrors:
-    """Distances `off_m (S, P)`, under S sets of poses, of P steps from those that images show."""
+    """`off_m (S, P)`: how far P steps lie from those that images show, under S sets of poses."""
 
     off_m: Floats
 
 
 def step_errors(source: Source, pairs: Ints, pose_sets: Floats, unit_m: float, *, step: Step) -> StepErrors:
-    """Step: of pairs (P, 2) of frames under sets of poses (S, K, 4, 4); NaN where a pair has no images that can be
-    read, or too few of its corners agree on a motion.
+    """Step: the errors of the steps between pairs (P, 2) of frames under sets of poses (S, K, 4, 4).
+
+    NaN where a pair has no readable images, or too few of its corners agree on a motion. `unit_m`: the recipe's scale.
     """
     off_m = np.full((len(pose_sets), len(pairs)), np.nan)
     images: dict[int, FlowImage | None] = {}

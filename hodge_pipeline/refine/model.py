@@ -1,4 +1,4 @@
-"""Refine a model with tracks: candidates weighed by one cost, the best of them kept, never one worse than the input."""
+"""Refine a model with tracks: make candidates, measure them by one cost, keep the best, or else the input."""
 
 from __future__ import annotations
 
@@ -11,35 +11,37 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.difference import alike
 from hodge_pipeline.evaluation.trajectory import align
 from hodge_pipeline.executors.dask import open_workers
-from hodge_pipeline.refine.candidates import GIVEN, Found, weigh
+from hodge_pipeline.refine.candidates import GIVEN, CandidateSet, make_candidates
 from hodge_pipeline.refine.choice import Choice, choose, held_out_score, refused_doubt
 from hodge_pipeline.refine.focal import intrinsics_doubt
-from hodge_pipeline.refine.guard import Change, Decision, Measure
+from hodge_pipeline.refine.guard import Decision, Measure, PoseChange
 from hodge_pipeline.refine.judge import SAME_COST, Cost, named
 from hodge_pipeline.refine.model_edges import held_out_distances
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_solve import Solved
+from hodge_pipeline.refine.pieces import pieces_doubt
 from hodge_pipeline.refine.scale import Scale, metric_scale
 from hodge_pipeline.refine.uncertainty import SIGMAS, loose, moves, told_apart
 from hodge_pipeline.stages import Steps, TrackedModel, Workers
 from hodge_pipeline.types import Floats
+from hodge_pipeline.types.arrays import rms
 
 NO_OBSERVATION = (
     "the model has no point that two images saw: nothing tells good poses from bad: triangulate points first"
 )
 ONE_IMAGE = "the model has one image with a pose: nothing tells whether it is right: give a model of two or more"
 JOIN_LOSS = 0.25
-"""Of the cost: so much more of it is the price of one model in place of several that each fitted its own images."""
+"""Share by which the cost may grow when models are joined: each was fitted to its own images alone."""
 NO_BASELINE = 1e-9
-"""Of the size of the model: a sensor nearer than this to its rig's origin is off it by rounding alone."""
+"""Share of the model's size below which a sensor's distance from its rig's origin is rounding."""
 
 
 @dataclass(frozen=True)
 class RefinedModel:
-    """One model refined, with the models it was made of.
+    """One refined model and the input models that it joins.
 
-    `start` is the input in metres (where depth tells) and joined; `model` the best candidate. `solved` is None where
-    the consistent solve was not needed.
+    `start` is the inputs joined, in metres where depth tells the scale; `model` the chosen candidate. `candidates` are
+    names with costs, of which row `kept_row` is written. `solved` is None where no consistent solve was needed.
     """
 
     inputs: tuple[TrackedModel, ...]
@@ -55,7 +57,7 @@ class RefinedModel:
 
     @property
     def kept(self) -> Sequence[TrackedModel]:
-        """The models to be written: the refined one, or the inputs as they came."""
+        """The models to be written: the refined one, or the inputs unchanged."""
         return self.inputs if self.decision.keeps_input else (self.model,)
 
 
@@ -68,9 +70,9 @@ def refine_models(
     force: bool = False,
     dask: str | None = None,
 ) -> tuple[RefinedModel, ...]:
-    """Every model refined, those that measurements tie together as one. Nothing is written but the steps.
+    """Every model refined; models that measurements join become one. Nothing is written but the steps.
 
-    `key` stands for the models and the options that open them. One of several that cannot be refined is a note. Raises
+    `key` identifies the models and the options that opened them. A model that cannot be refined becomes a note; raises
     `SourceError` where none can.
     """
     models, left_out = refinable(models)
@@ -87,7 +89,7 @@ def refine_models(
 
 
 def refinable(models: Sequence[TrackedModel]) -> tuple[Sequence[TrackedModel], tuple[str, ...]]:
-    """The models with observations that tell good poses from bad, and a line on each other one.
+    """The models whose observations can test poses, and a line on why each other one is left out.
 
     Raises `SourceError` where there is none.
     """
@@ -100,13 +102,14 @@ def refinable(models: Sequence[TrackedModel]) -> tuple[Sequence[TrackedModel], t
 
 
 def _unfit(model: TrackedModel) -> str:
+    """Why a model cannot be refined; "" where it can."""
     if model.quality.images < 2:
         return ONE_IMAGE
     return "" if (model.quality.track_lengths > 1).any() else NO_OBSERVATION
 
 
 def in_metres(model: TrackedModel, scale: Scale) -> TrackedModel:
-    """The model in metres, or as it is where depth does not tell its scale or finds it right."""
+    """The model in metres; unchanged where depth does not tell its scale, or tells that it is in metres."""
     return model if scale.is_one or not scale.is_observable else model.scaled(scale.metres_per_unit)
 
 
@@ -119,8 +122,9 @@ def _refine(
     workers: Workers,
     force: bool,
 ) -> RefinedModel:
+    """The joined model `start` refined: candidates, choice, scale, doubts, decision."""
     is_metric = all(scale.is_observable for scale in scales)
-    found = weigh(inputs, start, options, steps, workers, is_metric)
+    found = make_candidates(inputs, start, options, steps, workers, is_metric)
     distances_m = held_out_distances(found.depth, _metric_poses(found), workers)
     choice = choose(found, distances_m, options.seed, steps, force=force)
     at, chosen = choice.row, found.candidates[choice.row].model
@@ -136,6 +140,7 @@ def _refine(
         or cost.doubt
         or cost.images_doubt
         or refused_doubt(found, choice, distances_m)
+        or ("" if found.depth.graph.edge_count or in_world else pieces_doubt(model))
     )
     doubt = doubt or (_loose_doubt(start, model) if not found.candidates[at].holds_poses and not is_metric else "")
     decision = _placed_decision(start, found, choice) or _decision(found, choice, scales, force, bool(doubt))
@@ -150,24 +155,25 @@ def _refine(
 
 
 def _loose_doubt(start: TrackedModel, model: TrackedModel) -> str:
+    """Why a model without metres is in doubt: its poses moved by less than tracks fix them; "" where they do not."""
     if not told_apart(start, model):
         return "in doubt, since tracks hardly fix the poses, which moved by less than they leave open"
     names = [str(name) for name, one in zip(model.body_names, loose(start, model), strict=True) if one]
     return f"in doubt, since tracks fix {named(names)} less well than the poses moved" if names else ""
 
 
-def _placed_decision(start: TrackedModel, found: Found, choice: Choice) -> Decision | None:
-    """Of a model that was placed in the world the result is written, whether or not a candidate is better."""
+def _placed_decision(start: TrackedModel, found: CandidateSet, choice: Choice) -> Decision | None:
+    """The decision on a model that known positions placed in the world, which is always written; None of others."""
     if not start.placing:
         return None
-    off, name = found.positions_off, found.candidates[choice.row].name
+    off, name = found.position_errors_m, found.candidates[choice.row].name
     fit = f", {off[0]:.3g} → {off[choice.row]:.3g} m off in the median" if np.isfinite(off[0]) else ""
     told = f"mean error {' → '.join(alike(found.costs[0].px, found.costs[choice.row].px, 4))} px{_by(name)}"
     return Decision("refined", f"{start.placing}{fit}; {told}")
 
 
-def _decision(found: Found, choice: Choice, scales: Sequence[Scale], force: bool, doubted: bool) -> Decision:
-    """Whether the chosen candidate takes the place of the input."""
+def _decision(found: CandidateSet, choice: Choice, scales: Sequence[Scale], force: bool, doubted: bool) -> Decision:
+    """Whether the chosen candidate replaces the input; `doubted`: another check doubts even what is kept."""
     before, after = found.costs[0], found.costs[choice.row]
     name = found.candidates[choice.row].name
     if len(scales) > 1:
@@ -183,6 +189,7 @@ def _decision(found: Found, choice: Choice, scales: Sequence[Scale], force: bool
 
 
 def _join_decision(apart: Cost, joined: Cost, name: str, force: bool) -> Decision:
+    """Whether one model replaces several: it fits hardly worse than these apart, and puts no more images off."""
     told = f"mean error {apart.px:.4g} px apart, {joined.px:.4g} px as one{_by(name)}"
     if joined.px <= (1 + JOIN_LOSS) * apart.px and len(joined.images_off) <= len(apart.images_off):
         return Decision("refined", f"the models are one; {told}")
@@ -194,17 +201,18 @@ def _by(candidate: str) -> str:
 
 
 def _in_the_scale_of(start: TrackedModel, model: TrackedModel) -> TrackedModel:
-    """The model with the size that the start has: nothing measured tells another, unless a rig's baselines do."""
+    """The model scaled to the size of the start, which adjustment leaves free unless a rig's baselines fix it."""
     baselines = np.abs(start.body_from_cam[:, :3, 3]).max()
     if baselines > NO_BASELINE * np.ptp(start.world_from_body[:, :3, 3], axis=0).max():
         return model
     scale = align(model.world_from_body, start.world_from_body, with_scale=True).scale
-    return model.scaled(scale) if scale > 0 else model  # 0: all of the start's positions are one
+    return model.scaled(scale) if scale > 0 else model  # 0: the start's positions are all one
 
 
-def _metric_poses(found: Found) -> Floats:
-    """Image poses (K, N, 4, 4) of the candidates, each in metres by its own depth: bundle adjustment leaves the size
-    of a model free, and a better one of another size fits no cloud.
+def _metric_poses(found: CandidateSet) -> Floats:
+    """Image poses (K, N, 4, 4) of the candidates, each in metres by its own depth, to lay clouds of depth by.
+
+    Bundle adjustment leaves the size of a model free.
     """
     models = [candidate.model for candidate in found.candidates]
     poses = np.array([[frame.world_from_cam for frame in model.frames] for model in models])
@@ -215,9 +223,9 @@ def _metric_poses(found: Found) -> Floats:
 
 
 def _measures(
-    found: Found, at: int, start: TrackedModel, model: TrackedModel, distances_m: Floats
+    found: CandidateSet, at: int, start: TrackedModel, model: TrackedModel, distances_m: Floats
 ) -> tuple[Measure, ...]:
-    """What the report shows of the kept candidate beside the input."""
+    """What the report shows of the chosen candidate, row `at`, beside the input."""
     before, after = found.inputs, found.costs[at]
     count = before.observations
     cap = f"capped at {after.cap_px:.4g} px"
@@ -238,19 +246,19 @@ def _measures(
     return tuple(out)
 
 
-def _change(start: TrackedModel, scale: Scale, model: TrackedModel, in_world: bool) -> Change:
-    """How far the poses moved from those of the input, laid onto each other: in metres where depth tells the scale."""
+def _change(start: TrackedModel, scale: Scale, model: TrackedModel, in_world: bool) -> PoseChange:
+    """How far the bodies moved from the input's poses, aligned to them, and the uncertainty that the tracks leave."""
     before, after = start.world_from_body, model.world_from_body
     moved = moves(before, after)
     errors = model.standard_errors()
     known = errors[np.isfinite(errors).all(axis=1)]
     rotation, position = np.sqrt((known**2).mean(axis=0)) if len(known) else (np.nan, np.nan)
-    if scale.is_observable:  # the size of the whole is as sure as the scale
+    if scale.is_observable:  # an error of the scale moves a body by as much as it is from the middle
         size = np.sqrt(np.mean(np.sum((after[:, :3, 3] - after[:, :3, 3].mean(axis=0)) ** 2, axis=1)))
         position = float(np.hypot(position, scale.sigma * size))
-    return Change(
-        translation_m=float(np.sqrt(np.mean(moved[:, 1] ** 2))),
-        rotation_deg=float(np.degrees(np.sqrt(np.mean(moved[:, 0] ** 2)))),
+    return PoseChange(
+        translation_m=rms(moved[:, 1]),
+        rotation_deg=float(np.degrees(rms(moved[:, 0]))),
         translation_uncertainty_m=float(SIGMAS * position * np.sqrt(3)),
         rotation_uncertainty_deg=float(np.degrees(SIGMAS * rotation * np.sqrt(3))),
         is_metric=scale.is_observable or in_world,

@@ -1,4 +1,4 @@
-"""Edges of a model's bodies by its depth: overlapping clouds registered, some pairs kept out to judge by."""
+"""Edges between a model's bodies by depth: overlapping clouds registered, some pairs held out to judge by."""
 
 from __future__ import annotations
 
@@ -13,16 +13,20 @@ from hodge_pipeline.registration.clouds import CloudOptions, prepare_clouds
 from hodge_pipeline.registration.register import register_edges
 from hodge_pipeline.stages import Step, Steps, TrackedModel, Workers
 from hodge_pipeline.store.codec import CLOUDS
-from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, ViewGraph
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, ViewGraph
 from hodge_pipeline.types.text import counted
 
-HELD_OUT_SHARE, LEAST_HELD_OUT = 0.2, 4
-"""Of the pairs with depth: kept out of registration and solve, to judge the result by."""
+PAIRS_HELD_OUT, LEAST_HELD_OUT = 0.2, 4
+"""Share of the pairs with depth that no registration or solve sees, and how few are too few to judge by."""
 
 
 @dataclass(frozen=True)
 class DepthEdges:
-    """The registered edges between bodies; pairs (H, 2) held out, of the images (D,) with depth; and remarks."""
+    """Registered edges between bodies, and what judges a result by depth.
+
+    `images (D,)`: rows of the model's images with depth, whose `clouds` are in the same order; `held_out (H, 2)`: pairs
+    of rows of these D.
+    """
 
     graph: ViewGraph
     held_out: Ints
@@ -32,10 +36,10 @@ class DepthEdges:
 
 
 def depth_edges(model: TrackedModel, options: ModelRefinement, steps: Steps, workers: Workers) -> DepthEdges:
-    """Edges between the images that have depth, of a model in metres.
+    """Edges between the images that have depth, of a model in metres; none of fewer than two images.
 
-    Pairs are proposed and registered from the model's own poses, so drift beyond the registrar's reach is not closed
-    by depth alone.
+    Pairs are proposed and registered from the model's own poses, so depth alone closes no drift beyond the registrar's
+    reach.
     """
     images = np.array([row for row, frame in enumerate(model.frames) if frame.read_depth is not None], np.int64)
     if len(images) < 2:
@@ -48,7 +52,7 @@ def depth_edges(model: TrackedModel, options: ModelRefinement, steps: Steps, wor
     body = model.body_of_frame[images]
     between = body[candidates.pairs[:, 0]] != body[candidates.pairs[:, 1]]
     pairs = candidates.pairs[between]
-    held = held_out(len(pairs), HELD_OUT_SHARE, options.seed)
+    held = held_out(len(pairs), PAIRS_HELD_OUT, options.seed)
     chosen = Edges.of(pairs[~held], "depth")
     registered = steps.step(
         register_edges, chosen, clouds, options.registration, poses, title="registration", workers=workers
@@ -71,8 +75,8 @@ def depth_clouds(
     return prepare_clouds([model.frames[row] for row in images], options, workers, step.folder / CLOUDS, step.advance)
 
 
-def held_out(count: int, share: float, seed: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Which of so many pairs are kept out of the solve: a random share, none where they would be too few to judge."""
+def held_out(count: int, share: float, seed: int) -> Bools:
+    """Which (count,) of the pairs are held out: a random share, none where these would be too few to judge by."""
     chosen = np.zeros(count, bool)
     size = round(share * count)
     if size >= LEAST_HELD_OUT:
@@ -81,21 +85,21 @@ def held_out(count: int, share: float, seed: int) -> np.ndarray[tuple[int], np.d
 
 
 def held_out_distances(edges: DepthEdges, pose_sets: Floats, workers: Workers) -> Floats:
-    """The cloud-to-cloud distance (S, H) of the pairs held out, under sets of image poses (S, N, 4, 4), metres."""
+    """Cloud distances (S, H) of the pairs held out under S sets of poses (S, N, 4, 4) of all images, metres."""
     if edges.clouds is None or edges.clouds.folder is None or not len(edges.held_out):
         return np.zeros((len(pose_sets), 0))
     return edge_distances(edges.clouds.folder, edges.held_out, pose_sets[:, edges.images], workers)
 
 
 def no_depth_edges(model: TrackedModel) -> DepthEdges:
-    """What a model without depth has."""
+    """The edges of a model without depth: none, over its bodies."""
     none = np.zeros((0, 2), np.int64)
     graph = ViewGraph.from_edges(np.array(model.body_names), none, np.zeros((0, 4, 4)))
     return DepthEdges(graph, none, none[:, 0], None, ())
 
 
 def _between_bodies(model: TrackedModel, graph: ViewGraph, images: Ints) -> ViewGraph:
-    """`B_i Z B_j⁻¹` for the bodies that carry the images; the information is carried over by the adjoint."""
+    """Edges Z between cameras as edges `B_i Z B_j⁻¹` between bodies, B being body_from_cam; see `se3.pull_back`."""
     rows = images[graph.edges]
     cam_from_body = se3.inverse(model.body_from_cam[rows[:, 1]])
     return replace(

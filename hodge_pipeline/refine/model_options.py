@@ -1,4 +1,4 @@
-"""What the refinement of a model with tracks can be told: the recipe `colmap_refine`."""
+"""Options of refining a model with tracks: the recipe `colmap_refine`."""
 
 from __future__ import annotations
 

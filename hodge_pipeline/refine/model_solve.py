@@ -1,4 +1,4 @@
-"""The poses of a model's bodies that agree with all its edges, and how well the edges fix each position."""
+"""Poses of a model's bodies consistent with all its edges, and how well the edges fix each position."""
 
 from __future__ import annotations
 
@@ -11,48 +11,48 @@ from hodge_pipeline.complex.chi2 import chi2_by_information
 from hodge_pipeline.complex.short_cycles import short_cycles
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation.residuals import with_residuals
+from hodge_pipeline.refine.uncertainty import LEAST_WEIGHT
 from hodge_pipeline.solvers.covariance import marginal_covariances
 from hodge_pipeline.stages import ConsistencySolver
-from hodge_pipeline.types import Edges, Floats, PositionPriors, Solution, ViewGraph
+from hodge_pipeline.types import Bools, Edges, Floats, PositionPriors, Solution, ViewGraph
 
-MEDIAN_CHI2 = 5.348
-"""Of χ² with six degrees of freedom."""
-OUTLIER_CHI2 = 16.812
-"""Its 99 % quantile."""
+MEDIAN_CHI2, OUTLIER_CHI2 = 5.348, 16.812
+"""Median and 99 % quantile of χ² with six degrees of freedom."""
 ROUNDS = 2
+"""Solves, each with information calibrated at the last poses, on which that of edges without cycles depends."""
 LEAST_TRIANGLES, TRIANGLES_PER_EDGE = 10, 8
-"""Below it their median says little; of each edge so many serve."""
-KEPT = 1e-3
+"""Fewest triangles whose median counts, and the most that are listed of an edge."""
 
 
 @dataclass(frozen=True)
 class Solved:
-    """The graph with its information set right, the solution on it, and which of its edges count (E,)."""
+    """The graph with calibrated information, and the solution of it."""
 
     graph: ViewGraph
     solution: Solution
 
     @property
-    def kept(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """The edges (E,) that agree with the poses."""
-        return np.asarray(self.solution.weights > KEPT)
+    def kept(self) -> Bools:
+        """The edges (E,) to which the solver left a weight."""
+        return np.asarray(self.solution.weights > LEAST_WEIGHT)
 
     def edges(self, world_from_body: Floats) -> Edges:
-        """The edges with what they miss the poses (B, 4, 4) by."""
+        """The table of the edges with their residuals at the poses (B, 4, 4)."""
         return with_residuals(Edges.measured(self.graph), world_from_body, self.solution.weights)
 
     def chi2(self, world_from_body: Floats) -> float:
-        """The mean over all edges of χ² per degree of freedom, an outlier's cut off where the solver cuts it."""
+        """The mean over all edges of χ² per degree of freedom at the poses (B, 4, 4), capped at the 99 % quantile."""
         squares = np.minimum(chi2_by_information(self.graph, world_from_body), OUTLIER_CHI2)
         return float(squares.mean() / 6) if len(squares) else float("nan")
 
 
 def calibrated(graph: ViewGraph, world_from_body: Floats) -> ViewGraph:
-    """The graph with the information of each kind of edge scaled so that half of its triangles close within the median
-    of χ²; of a kind with few triangles, so that half of its edges fit the poses.
+    """The graph with the information of each kind of edge (`source`) scaled to fit how well its triangles close.
 
-    What a registrar or a two-view geometry says of itself leaves out what its points share (the lens, the sensor's
-    warp), so it is too sure, each kind by a factor of its own. The poses may be the disturbed ones: cycles are not.
+    The median χ² of a kind's triangles becomes that of the distribution; of a kind with few triangles, the median χ² of
+    its edges at the poses (B, 4, 4). Registrars and two-view geometry know nothing of errors that their points share
+    (lens, sensor warp), so each kind is overconfident by a factor of its own. Triangles do not depend on the poses,
+    which may be wrong.
     """
     factor = np.ones(graph.edge_count)
     for source in np.unique(graph.source):
@@ -67,7 +67,7 @@ def calibrated(graph: ViewGraph, world_from_body: Floats) -> ViewGraph:
 
 
 def triangle_chi2(graph: ViewGraph) -> Floats:
-    """χ² (T,) of the motion that each triangle of edges leaves over, by the covariances of its three edges."""
+    """χ² (T,) of the motion round each triangle of edges, by the covariances of its three edges, propagated."""
     loops = short_cycles(graph.edges, graph.vertex_count, TRIANGLES_PER_EDGE)
     first = loops.offsets[:-1][loops.lengths == 3]
     at = first[:, None] + np.arange(3)
@@ -84,19 +84,20 @@ def triangle_chi2(graph: ViewGraph) -> Floats:
 
 
 def solve_bodies(graph: ViewGraph, world_from_body: Floats, solver: ConsistencySolver) -> Solved:
-    """The consistent poses, from the model's own; the noise of edges without cycles is taken at those so far."""
+    """The consistent poses of the bodies, from the model's own (B, 4, 4), with calibrated information."""
     poses = world_from_body
     for _ in range(ROUNDS):
-        right = calibrated(graph, poses)
-        solution = solver.solve(right, poses)
+        weighted = calibrated(graph, poses)
+        solution = solver.solve(weighted, poses)
         poses = solution.world_from_cam
-    return Solved(right, solution)
+    return Solved(weighted, solution)
 
 
 def position_priors(solved: Solved) -> PositionPriors | None:
-    """Where the solution puts each body, as sure as its edges are; none of bodies that no edge holds.
+    """The solved position of each body with the marginal covariance that its edges leave; NaN without an edge.
 
-    The bodies that fix the gauge are taken to be as sure as the others on average.
+    A body that fixes the gauge has no covariance: it takes the mean of the others'. None where there are no others, or
+    the graph is singular.
     """
     poses = solved.solution.world_from_cam
     kept = solved.graph.select(np.flatnonzero(solved.kept))

@@ -1,4 +1,4 @@
-"""Open3D's own objects, by what they hold: nothing of Open3D is imported, so that a program without it pays nothing."""
+"""Open3D's trajectories and pose graphs, by their attributes: Open3D itself is not imported."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def with_poses(trajectory: CameraTrajectory, world_from_cam: Floats) -> CameraTr
 
 
 def graph_of(pose_graph: PoseGraph) -> tuple[ViewGraph, Floats]:
-    """The measured graph and the nodes' poses (V, 4, 4). Raises `GraphError` for an edge to no node."""
+    """The measured graph and the nodes' poses (V, 4, 4) world_from_node. Raises `GraphError` for an edge to no node."""
     poses = np.array([np.asarray(node.pose, float) for node in pose_graph.nodes]).reshape(-1, 4, 4)
     edges = list(pose_graph.edges)
     pairs = np.array([(edge.target_node_id, edge.source_node_id) for edge in edges], np.int64).reshape(-1, 2)
@@ -67,8 +67,8 @@ def graph_of(pose_graph: PoseGraph) -> tuple[ViewGraph, Floats]:
 def solve_pose_graph(pose_graph: PoseGraph) -> PoseGraph:
     """A copy of Open3D's pose graph with consistent poses, in place of its `global_optimization`.
 
-    Edges that disagree with the others, loop closures or not, are left out: their `confidence` becomes 0, that of the
-    others 1. The first node keeps its pose. Raises `GraphError` for numbers that are no graph.
+    Edges that contradict the others, loop closures or not, are left out: their `confidence` becomes 0, that of the
+    others 1. The first node keeps its pose. Raises `GraphError` for motions or pairs that are none.
     """
     graph, poses = graph_of(pose_graph)
     solution = solve_robust(replace(graph, fixed=np.zeros(1, np.int64)), start=poses)

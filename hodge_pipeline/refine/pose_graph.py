@@ -1,4 +1,4 @@
-"""A pose-graph file solved: read by whichever reader knows it, solved, written back with its ids, edges and order."""
+"""Solve a pose-graph file: any registered format is read, and written back with its ids, edges and order."""
 
 from __future__ import annotations
 
@@ -29,17 +29,21 @@ from hodge_pipeline.types.text import command, counted
 
 RUN_GRAPH = "graph.g2o"
 ROUNDING = 1e-15
-"""Of the cost before: so much is left of one that vanishes."""
+"""Share of the first cost that rounding leaves of one that vanishes."""
 GRAPH_WRITERS = ("g2o", "open3d_pose_graph")
-"""Writers that take the poses by the rows of the vertices."""
+"""Writers of a graph, whose poses are in the order of its vertices."""
 OBJECTIVES = {"full": "chi2", "isotropic": "F"}
+"""How a headline names each objective."""
 SESYNC_UNITS = np.array([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
-"""SE-Sync takes the information of q_vec, half an angle, for that of the angle."""
+"""SE-Sync reads g2o's information of the quaternion's vector part, half an angle, as that of the angle."""
+UNTOLD = "the odometry states no errors of some axes: --robust learns them from the loops, which may be far better"
+MOST_POSES_FILMED = 20_000
+"""Above it the recording shows the start and the end of the solve only."""
 
 
 @dataclass(frozen=True)
-class Choices:
-    """How a file is solved; `disable` holds pairs of vertex ids, `a-b`."""
+class SolveOptions:
+    """How a file is solved; `disable` names pairs of vertex ids, `a-b`, and `trust` the edges of a backbone."""
 
     objective: ObjectiveName = "full"
     initial: InitialName = "chordal"
@@ -58,7 +62,7 @@ class SolvedFile:
     source: Source
     graph: ViewGraph
     solution: Solution
-    choices: Choices
+    choices: SolveOptions
     cpu_s: float
     wall_s: float
 
@@ -69,7 +73,7 @@ class SolvedFile:
 
     @property
     def doubt(self) -> str:
-        """Why the poses are not to be trusted; empty where nothing speaks against them."""
+        """Why the poses are not to be trusted; "" where nothing speaks against them."""
         solution = self.solution
         if solution.confirmed is False:
             return "NOT CONFIRMED by any cycle of its edges"
@@ -79,7 +83,7 @@ class SolvedFile:
 
     @property
     def headline(self) -> str:
-        """What the solve did to its own objective: a file of edges has nothing else to measure poses by."""
+        """The verdict: the objective before and after, the only measure of poses that a graph of edges gives."""
         summary = self.summary()
         before, after, name = summary["cost_before"], summary["cost_after"], OBJECTIVES[summary["objective"]]
         after = after if after > ROUNDING * max(before or 0.0, 1.0) else 0.0
@@ -93,7 +97,7 @@ class SolvedFile:
         return f"Solved, but {self.doubt}: {fell}" if self.doubt else f"Solved{proven}: {fell}"
 
     def summary(self) -> dict[str, Any]:
-        """The numbers of the solve under stable keys, for people and programs."""
+        """The numbers of the solve under keys that stay, for `--json` and the report."""
         metrics, graph = self.solution.metrics, self.graph
         return {
             "poses": graph.vertex_count,
@@ -118,9 +122,9 @@ class SolvedFile:
 
 
 def read_graph(path: Path) -> Source:
-    """The graph at a path: of any registered format, or of a run folder; a note says if its motions look inverted.
+    """A source with the graph at a path, of any registered format or a run folder; a note where motions look inverted.
 
-    Raises `SourceError` where there is none.
+    Raises `SourceError` where there is no graph.
     """
     path = path / RUN_GRAPH if (path / RUN_GRAPH).is_file() else path
     reader = guess_reader(path)
@@ -149,20 +153,20 @@ def disabled_edges(graph: ViewGraph, pairs: Sequence[str]) -> Bools:
     return found
 
 
-def solve_file(path: Path, choices: Choices) -> SolvedFile:
-    """The solution of the graph at a path. Raises `SourceError`, `GraphError` where it cannot be read or solved."""
+def solve_file(path: Path, options: SolveOptions) -> SolvedFile:
+    """The graph at a path, solved. Raises `SourceError`, `GraphError` where it cannot be read or solved."""
     source = read_graph(path)
     assert source.graph is not None
     start = None if source.trajectory is None else source.trajectory.world_from_cam
-    if choices.initial == "given" and start is None:
+    if options.initial == "given" and start is None:
         raise SourceError(f"{source.path}: has no pose for every vertex to start from: use --start chordal")
-    off = disabled_edges(source.graph, choices.disable)
+    off = disabled_edges(source.graph, options.disable)
     graph = source.graph.select(~off)
-    if choices.sesync_units and graph.dimension == 3:
+    if options.sesync_units and graph.dimension == 3:
         graph = replace(graph, information=graph.information * np.outer(SESYNC_UNITS, SESYNC_UNITS))
     cpu_s, wall_s = time.process_time(), time.monotonic()
-    solution = _solved(graph, start, choices)
-    if not choices.robust and not credible_steps(graph, sequential_edges(graph))[1]:
+    solution = _solved(graph, start, options)
+    if not options.robust and not credible_steps(graph, sequential_edges(graph))[1]:
         solution = replace(solution, notes=(UNTOLD, *solution.notes))
     cpu_s, wall_s = time.process_time() - cpu_s, time.monotonic() - wall_s
     weights = np.zeros(len(off))
@@ -170,40 +174,33 @@ def solve_file(path: Path, choices: Choices) -> SolvedFile:
     notes = (
         (f"{counted(int(off.sum()), 'edge is|edges are')} disabled", *solution.notes) if off.any() else solution.notes
     )
-    return SolvedFile(source, source.graph, replace(solution, weights=weights, notes=notes), choices, cpu_s, wall_s)
+    return SolvedFile(source, source.graph, replace(solution, weights=weights, notes=notes), options, cpu_s, wall_s)
 
 
-UNTOLD = "the odometry states no errors of some axes: --robust learns them from the loops, which may be far better"
-
-
-def _solved(graph: ViewGraph, start: Floats | None, choices: Choices) -> Solution:
-    if choices.robust:
+def _solved(graph: ViewGraph, start: Floats | None, options: SolveOptions) -> Solution:
+    if options.robust:
         return solve_robust(
             graph,
             start=start,
-            diagnosis=DiagnosisOptions(trust=choices.trust),
-            objective=choices.objective,
-            certificate=choices.certificate,
+            diagnosis=DiagnosisOptions(trust=options.trust),
+            objective=options.objective,
+            certificate=options.certificate,
         )
     return solve(
         graph,
         start=start,
-        objective=choices.objective,
-        initial=choices.initial,
-        certificate=choices.certificate,
-        time_limit_s=choices.time_limit_s,
+        objective=options.objective,
+        initial=options.initial,
+        certificate=options.certificate,
+        time_limit_s=options.time_limit_s,
         keep_history=graph.vertex_count <= MOST_POSES_FILMED,
     )
 
 
-MOST_POSES_FILMED = 20_000
-"""Above it the recording shows the start and the end of the solve only."""
-
-
 def write_solved(path: Path, solved: SolvedFile, writer: str = "g2o") -> None:
-    """The solved poses in the format of a writer; where that is of graphs, with every edge as it was measured.
+    """Write the solved poses; a writer of graphs also gets every edge as measured, ignored ones too, in the order read.
 
-    Ignored edges are written too, all in the order read. Poses without edges are in the order of the vertices' numbers.
+    A writer of poses gets them in the order of the vertices' numbers.
     """
     poses, graph = solved.solution.world_from_cam, solved.graph
     trajectory = Trajectory(np.arange(len(poses), dtype=float), poses)
@@ -213,7 +210,7 @@ def write_solved(path: Path, solved: SolvedFile, writer: str = "g2o") -> None:
 
 
 def vertex_trajectory(graph: ViewGraph, world_from_vertex: Floats) -> Trajectory:
-    """Poses (V, 4, 4) in the order of the vertices' numbers, which are the stamps; of names the rows are."""
+    """Poses (V, 4, 4) by the numbers of their vertices, which become the stamps; vertices with names count by row."""
     ids = graph.vertex_ids
     numbers = ids.astype(float) if ids.dtype.kind in "iu" else np.arange(len(ids), dtype=float)
     order = np.argsort(numbers, kind="stable")

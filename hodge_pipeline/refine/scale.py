@@ -10,26 +10,25 @@ import numpy as np
 from hodge_pipeline.types import Floats
 from hodge_pipeline.types.text import counted
 
-LEAST_POINTS = 50
-LEAST_IMAGES = 3
+LEAST_POINTS, LEAST_IMAGES = 50, 3
+"""Points with depth, and images that see them, below which the scale is not told."""
 MAX_SPREAD = 0.15
-"""Half the ratios lie this near to their median, as a share of it, or the depth is not of these images: the depth of a
-sensor agrees to a few per cent, that of other images to some thirty."""
-TO_SIGMA = 1.4826
-"""Of a median of absolute deviations."""
-OF_MEDIAN = 1.2533
-"""The standard error of a median over that of a mean."""
+"""Median deviation of the ratios, as a share, beyond which the depth is not of these images: a sensor's own depth
+agrees to a few per cent, that of other images to some thirty."""
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of a Gaussian over its median absolute deviation."""
+MEDIAN_TO_MEAN = 1.2533
+"""Standard error of the median of Gaussian samples over that of their mean."""
 LEAST_SIGMA = 1e-4
-
-
+"""Floor of the relative standard error: no depth sensor's calibration is known better."""
 NO_DEPTH = "there is no depth"
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Metres in one unit of a model, with its relative standard error; 1 and a reason where it cannot be told.
+    """Metres in one unit of a model, with the relative standard error `sigma`; 1 and a `reason` where unknown.
 
-    `spread`: the median deviation of a single point's ratio, as a share.
+    `spread`: the median deviation of the points' ratios from their median, as a share of it.
     """
 
     metres_per_unit: float
@@ -46,7 +45,7 @@ class Scale:
 
     @property
     def doubt(self) -> str:
-        """Why a model is not in metres though it has depth."""
+        """Why a model that has depth is not in metres; "" where it is, or has none."""
         return f"not in metres, since {self.reason}" if self.reason and self.reason != NO_DEPTH else ""
 
     @property
@@ -65,10 +64,10 @@ class Scale:
 
 
 def metric_scale(ratios: Sequence[Floats]) -> Scale:
-    """The median of all ratios metres / units, one array for each image.
+    """The scale by ratios (P,) of sensor depth in metres to depth in the model, one array for each image: their median.
 
-    Errors within an image (of its pose, of the sensor's calibration) are shared, so the standard error is that of the
-    median of the images' own medians.
+    Points of one image share the errors of its pose and calibration, so the standard error is that of the median of the
+    images' own medians.
     """
     useful = [one for one in ratios if len(one)]
     found = np.concatenate([np.zeros(0), *useful])
@@ -86,8 +85,8 @@ def metric_scale(ratios: Sequence[Floats]) -> Scale:
         )
         return _unknown(len(found), len(useful), reason)
     middles = np.array([np.median(one) for one in useful]) / scale
-    deviation = TO_SIGMA * float(np.median(np.abs(middles - np.median(middles))))
-    sigma = max(OF_MEDIAN * deviation / np.sqrt(len(useful)), LEAST_SIGMA)
+    deviation = MAD_TO_SIGMA * float(np.median(np.abs(middles - np.median(middles))))
+    sigma = max(MEDIAN_TO_MEAN * deviation / np.sqrt(len(useful)), LEAST_SIGMA)
     return Scale(scale, sigma, len(found), len(useful), spread)
 
 

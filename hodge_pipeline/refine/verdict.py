@@ -1,4 +1,4 @@
-"""The end of a run that started from given poses: measured against them, decided, spread over all frames, written."""
+"""The end of a run that refines given poses: measure the result against them, decide, write it for all frames."""
 
 from __future__ import annotations
 
@@ -15,42 +15,46 @@ from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.pairs.held_out import held_out_pairs
-from hodge_pipeline.refine.guard import Decision, Measure, decide
+from hodge_pipeline.refine.guard import SCORE_TOLERANCE, Decision, Measure, decide
 from hodge_pipeline.refine.image_steps import MOST_STEPS, step_errors
-from hodge_pipeline.refine.uncertainty import change, mean_chi2
+from hodge_pipeline.refine.uncertainty import mean_chi2, pose_change
 from hodge_pipeline.rounds.one_round import Work
 from hodge_pipeline.rounds.settling import last_shift_m, settled_m
 from hodge_pipeline.scene import KeyFrames, Round
 from hodge_pipeline.sources.inspect import guesses
 from hodge_pipeline.stages import Step, Workers
 from hodge_pipeline.types import CloudSet, Floats, Ints, Source, Trajectory
+from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.notes import Note
 
 CHI2_TOLERANCE = 0.02
-"""Of the start's: the solver minimises a robust cost, not this one."""
-SIGMAS = 3.0
-"""Standard errors of the mean change of the score that its own noise may reach."""
-LEAST_TOLERANCE = 0.002
-"""Of the score: what a fraction of a millimetre does."""
+"""Share by which the mean χ² may grow: the solver minimises a robust cost, not this one."""
+NOISE_SIGMAS = 3.0
+"""Standard errors of a mean difference that count as its noise."""
 KNOTS_APART = (16, 8, 4, 2, 1)
-"""Key frames: between two knots of the correction the steps are those given, which may be better than registered ones.
-The widest spacing is kept that fits the held-out pairs as well as the best."""
-
-STEP_TOLERANCE, STEP_TOLERANCE_MM, ROUGHER = 1.0, 5.0, 0.1
-"""Registered steps may be rougher than a visual odometry's and yet drift less, which is told from the third on, a share
-as the first is; steps twice as far from those of images, and by more than the second in a room, are of other poses."""
+"""Key frames between two knots of the correction: the steps between keep their given shape, which may be better than
+registered ones. The widest spacing that fits the held-out pairs as well as the best is kept."""
+STEP_TOLERANCE, STEP_TOLERANCE_MM = 1.0, 5.0
+"""Share, and millimetres in a room, by which steps may get farther from those of images. Registered steps may be
+rougher than a visual odometry's and yet drift less; steps twice as far off belong to other poses."""
+ROUGHER = 0.1
+"""Share from which on rougher steps are reported."""
 FEWEST_STEPS = 6
-TOLD_SIZE, LARGEST_SIZE, SIZE_LEAVES = 0.005, 0.1, 0.5
-"""The share by which a path grows or shrinks from which on that is told, or refused, and the share of the movement that
-it then leaves: drift bends a path, and focal lengths are known to a few per cent."""
+"""Steps that images measure: fewer are not judged."""
+TOLD_SIZE, LARGEST_SIZE = 0.005, 0.1
+"""Share by which a path may grow or shrink before it is reported, and before the result is refused: focal lengths are
+known to a few per cent."""
+SIZE_LEAVES = 0.5
+"""Share of the movement left after scaling, up to which scale explains it: drift bends a path instead."""
 LEAST_JOINED = 0.2
-"""Of the key frames: the least that overlap with another one where the given poses are of these frames."""
+"""Share of the key frames that must overlap with another one, else the given poses are not of these frames."""
 
 
 @dataclass(frozen=True)
 class Refined:
-    """What a refinement came to: the decision, poses (N, 4, 4) of all frames, and the name, in the run folder, of the
-    written file of poses, or of the folder; empty where nothing is written.
+    """The decision of a refinement, poses (N, 4, 4) of all frames, and the `file` or folder of poses in the run folder.
+
+    `file` is "" where nothing is written.
     """
 
     decision: Decision
@@ -59,9 +63,9 @@ class Refined:
 
 
 def finish(work: Work, folder: Path, rounds: Sequence[Round]) -> Refined:
-    """The decision on the last round's poses, and `refined.<suffix>` in the run folder.
+    """Decide on the last round's poses and write `refined.<suffix>` into the run folder.
 
-    Without an edge there is nothing to decide: nothing is written but the report.
+    Without an edge that relates the poses nothing is written but the report.
     """
     key_frames = work.scene.key_frames
     decision, after = _decision(work, rounds, key_frames)
@@ -72,7 +76,7 @@ def finish(work: Work, folder: Path, rounds: Sequence[Round]) -> Refined:
 
 
 def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tuple[Decision, Floats]:
-    """The decision, and the poses (K, 4, 4) of the key frames that it is on."""
+    """The decision, and the poses (K, 4, 4) of the key frames that it is about."""
     last, before = rounds[-1], key_frames.world_from_key
     nothing = _nothing(last)
     if nothing or last.solution is None:
@@ -80,16 +84,16 @@ def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
     chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, last.world_from_cam)]
     after, measures = _held_out(work, rounds, key_frames)
     measures.append(chi2_measure(*chi2))
-    moved = change(last.graph, replace(last.solution, world_from_cam=after), before)
+    moved = pose_change(last.graph, replace(last.solution, world_from_cam=after), before)
     decision = decide(measures, moved, force=work.recipe.guard.force)
-    if decision.outcome == "refined":  # by clouds, which a sensor may warp alike in every frame
+    if decision.outcome == "refined":  # so far by clouds alone, which a sensor may warp alike in every frame
         measures += [*_images(work, key_frames, after), *_size(work, before, after), *_settled(work, rounds)]
         decision = decide(measures, moved, force=work.recipe.guard.force)
     return decision, after
 
 
 def _nothing(last: Round) -> str:
-    """Why nothing was measured that relates the poses; empty where something was."""
+    """Why no measurement relates the poses; "" where one does."""
     if not last.graph.edge_count or last.solution is None:
         rejected = ", ".join(f"{count} {reason}" for reason, count in last.edges.rejected_counts.items())
         return f"no edge joins two frames ({rejected or 'no pair overlaps'}): nothing was refined"
@@ -103,7 +107,7 @@ def _nothing(last: Round) -> str:
 
 
 def spread_corrections(key_frames: KeyFrames, after: Floats) -> Floats:
-    """The poses (S, K, 4, 4) of the key frames, corrected as every S-th one was: the widest of `KNOTS_APART` first."""
+    """Key-frame poses (S, K, 4, 4), one set for each spacing of `KNOTS_APART`: knots as solved, given steps between."""
     out, count = [], len(after)
     for apart in KNOTS_APART:
         knots = np.union1d(np.arange(0, count, apart), count - 1)
@@ -113,13 +117,14 @@ def spread_corrections(key_frames: KeyFrames, after: Floats) -> Floats:
 
 
 def chi2_measure(before: float, after: float) -> Measure:
-    """The mean χ² of the edges, which may grow by a little."""
+    """The mean χ² of the edges before and after, which may grow by `CHI2_TOLERANCE`."""
     return Measure("edge chi2, mean", before, after, tolerance=CHI2_TOLERANCE * before)
 
 
 def _held_out(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tuple[Floats, list[Measure]]:
-    """The corrected poses (K, 4, 4) that keep most of the given steps of those that fit the pairs kept out of every
-    round best; and the score of these pairs, whose tolerance is its own standard error.
+    """The widest spaced correction (K, 4, 4) that fits the pairs held out of every round, and their score as a measure.
+
+    Without such pairs the last round's poses, and no measure.
     """
     pairs, after = held_out_pairs(rounds), rounds[-1].world_from_cam
     if not len(pairs):
@@ -135,7 +140,7 @@ def _held_out(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
     row = 1 + first_as_good(scores[1:])
     scores, distances = scores[[0, row]], distances[[0, row]]
     error = float((scores[1] - scores[0]).std() / np.sqrt(len(pairs)))
-    tolerance = max(SIGMAS * error, LEAST_TOLERANCE)
+    tolerance = max(NOISE_SIGMAS * error, SCORE_TOLERANCE)
     mean_mm, mean = distances.mean(axis=1) * 1000, scores.mean(axis=1)
     apart = f"{mean_mm[0]:.3g} mm apart before, {mean_mm[1]:.3g} mm after"
     work.steps.note(Note("held out", len(pairs), f"{apart}, the correction at every {KNOTS_APART[row - 1]}. key frame"))
@@ -144,10 +149,10 @@ def _held_out(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
 
 
 def _images(work: Work, key_frames: KeyFrames, after: Floats) -> list[Measure]:
-    """How far steps from key frame to key frame lie from those that images show; empty where there are none."""
+    """How far steps between successive key frames lie from those of optical flow; empty without images or depth."""
     sequence = key_frames.sequence[key_frames.rows]
     firsts = np.flatnonzero(sequence[1:] == sequence[:-1])
-    firsts = firsts[np.unique(np.linspace(0, len(firsts) - 1, min(MOST_STEPS, len(firsts))).round().astype(int))]
+    firsts = firsts[evenly(len(firsts), MOST_STEPS)]
     poses, source = np.stack([key_frames.world_from_key, after]), work.scene.source
     if not len(firsts) or not all(frame.read_colour and frame.read_depth for frame in source.frames):
         return []
@@ -160,12 +165,12 @@ def _images(work: Work, key_frames: KeyFrames, after: Floats) -> list[Measure]:
     mean = float(before_mm.mean()), float(after_mm.mean())
     if mean[1] > (1 + ROUGHER) * mean[0] + error_mm:
         work.steps.note(Note("rougher", detail=f"{mean[1]:.3g} mm off, before {mean[0]:.3g} mm"))
-    tolerance_mm = max(SIGMAS * error_mm, STEP_TOLERANCE * mean[0], STEP_TOLERANCE_MM * scale)
+    tolerance_mm = max(NOISE_SIGMAS * error_mm, STEP_TOLERANCE * mean[0], STEP_TOLERANCE_MM * scale)
     return [Measure("steps off those of images", *mean, tolerance=tolerance_mm, unit="mm")]
 
 
 def _size(work: Work, before: Floats, after: Floats) -> list[Measure]:
-    """By what share the path (K, 4, 4) became larger or smaller; empty where poses moved mostly in other ways."""
+    """The share by which the path (K, 4, 4) grew or shrank; empty where a scale does not explain how poses moved."""
     if len(before) < 3:
         return []
     spreads = [float(np.linalg.norm(poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0))) for poses in (before, after)]
@@ -179,7 +184,7 @@ def _size(work: Work, before: Floats, after: Floats) -> list[Measure]:
 
 
 def _settled(work: Work, rounds: Sequence[Round]) -> list[Measure]:
-    """How far the last round still moved the poses, beside what it may; empty where they have settled."""
+    """How far the last round may move the poses, and moved them; empty where they have settled."""
     last = rounds[-1]
     component = connected_components(last.graph.edges, last.graph.vertex_count)
     limit_m = settled_m(last.world_from_cam[:, :3, 3], float(work.recipe.scale))
@@ -190,22 +195,25 @@ def _settled(work: Work, rounds: Sequence[Round]) -> list[Measure]:
 
 
 def first_as_good(scores: Floats) -> int:
-    """The first row of scores (S, P) whose mean is that of the best row, within the noise of their differences."""
+    """The first row of scores (S, P) whose mean is within one standard error of the best row's."""
     losses = scores[scores.mean(axis=1).argmax()] - scores
-    noise = np.maximum(losses.std(axis=1) / np.sqrt(scores.shape[1]), LEAST_TOLERANCE)
+    noise = np.maximum(losses.std(axis=1) / np.sqrt(scores.shape[1]), SCORE_TOLERANCE)
     return int(np.flatnonzero(losses.mean(axis=1) <= noise)[0])
 
 
 def held_out_distances_m(
     clouds: CloudSet, pairs: Ints, pose_sets: Floats, scale: float, *, workers: Workers, step: Step
 ) -> Floats:
-    """Step: how far apart (S, P) the clouds of pairs lie, metres, under sets of poses (S, K, 4, 4)."""
+    """Step: cloud distances (S, P) of the pairs (P, 2) under S sets of poses (S, K, 4, 4), metres."""
     assert clouds.folder is not None
     return edge_distances(clouds.folder, pairs, pose_sets, workers, scale=scale)
 
 
 def _write(work: Work, folder: Path, decision: Decision, after: Floats) -> Path | None:
-    """`refined.<suffix>`: the input's own bytes where it is kept, else its form with the refined poses."""
+    """Write `refined.<suffix>`: the input's own bytes where it is kept, else the refined poses in its format.
+
+    A format without a rewriter becomes `refined.tum`, with a note. None where the poses came from no file.
+    """
     given = work.scene.given
     if given is None:
         return None

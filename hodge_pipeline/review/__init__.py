@@ -1,1 +1,1 @@
-"""Review by hand: a page on this machine that shows edges, takes decisions and solves after each."""
+"""Review edges by hand: a page on this machine shows them, takes decisions and solves after each."""

@@ -1,4 +1,4 @@
-"""An edge put in by hand: a first guess, the run's own registrar, and what it says of the cycles."""
+"""An edge added by hand: a first guess, registration by the run's own registrar, acceptance and residual."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.types import CloudSet, Edges, Floats, Registration, ViewGraph
 
 LEAST_POINTS = 3
+"""Point pairs that fix a rigid motion."""
 LEAST_SPREAD = 1e-3
 """Second singular value over the first of the points clicked, below which they lie on a line."""
 
@@ -21,9 +22,11 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Candidate:
-    """A pair of vertex rows to be joined: its guess `i_from_j (4, 4)` and what that comes from, the points clicked in
-    each cloud, then what the registrar found, why acceptance rejects it (empty where it does not), and how far it is
-    from the present poses.
+    """A pair of vertex rows (i, j) that may become an edge.
+
+    - `guess (4, 4)`: i_from_j, from `guess_by`; `points_i`, `points_j`: points clicked, in the axes of each camera.
+    - `found`: the registration, None before it; `rejected`: why acceptance rejects that, "" where it does not;
+      `residual_m`, `residual_deg`: how far it is from the present poses.
     """
 
     i: int
@@ -39,11 +42,11 @@ class Candidate:
 
     @property
     def motion(self) -> Floats:
-        """The motion that was found, or else the guess."""
+        """The motion i_from_j (4, 4) that was registered, else the guess."""
         return self.guess if self.found is None else self.found.i_from_j
 
     def clicked(self, point: Point) -> Candidate:
-        """With one more point, in turn in i's and in j's cloud; from three pairs on they make the guess."""
+        """The candidate with one more point, in i's and in j's cloud by turns; three pairs or more make the guess."""
         first, second = self.points_i, self.points_j
         first, second = ((*first, point), second) if len(first) == len(second) else (first, (*second, point))
         guess, by = self.guess, self.guess_by
@@ -53,7 +56,7 @@ class Candidate:
 
 
 def guess_from_points(points_in_i: Floats, points_in_j: Floats) -> Floats:
-    """The rigid motion `i_from_j (4, 4)` that lays points (N, 3) of j best onto those of i (Arun 1987).
+    """The rigid motion `i_from_j (4, 4)` with the least squared distances of point pairs (N, 3) (Arun et al. 1987).
 
     Raises `GraphError` for fewer than three pairs, or pairs on a line.
     """
@@ -68,7 +71,7 @@ def guess_from_points(points_in_i: Floats, points_in_j: Floats) -> Floats:
 
 
 def register_candidate(recipe: Recipe, clouds: CloudSet, wanted: Candidate) -> Registration:
-    """What the recipe's registrar finds for the pair, from its guess; of a run that recipe is `run.scaled_recipe`.
+    """The pair registered from its guess by the registrar of a run's `scaled_recipe`.
 
     Raises `GraphError` where a frame has no cloud.
     """
@@ -83,7 +86,7 @@ def register_candidate(recipe: Recipe, clouds: CloudSet, wanted: Candidate) -> R
 def assessed(
     recipe: Recipe, graph: ViewGraph, world_from_cam: Floats, wanted: Candidate, found: Registration
 ) -> Candidate:
-    """The candidate with what was found, why the recipe's acceptance rejects it, and its distance from the poses."""
+    """The candidate with its registration, the acceptance's reason against it, and the residual at poses (V, 4, 4)."""
     row = Edges.of([[wanted.i, wanted.j]]).with_registrations([found])
     residual_m, residual_rad = edge_residuals(row.as_graph(graph.vertex_ids), world_from_cam)
     return replace(

@@ -1,4 +1,4 @@
-"""The two clouds of an edge in the scene: one fades into the other's place, is cut, or is moved by hand."""
+"""The two clouds of an edge in the scene: faded between two poses, cut, or moved by hand."""
 
 from __future__ import annotations
 
@@ -12,22 +12,24 @@ from hodge_pipeline.review.session import Session
 from hodge_pipeline.types import CloudSet, Floats, Floats32
 
 FIRST, SECOND, SOLVED, PICKED = (0, 114, 178), (230, 120, 0), (0, 158, 115), (190, 0, 190)
-"""The first cloud; the second as the edge says, and as the solution says; points clicked."""
+"""Colours of the first cloud; of the second at the edge's pose and at the solution's; of clicked points."""
 MOST_POINTS = 200_000
-"""Of each cloud."""
+"""Points drawn of each cloud."""
 SLICES = 10
-"""Random parts of the second cloud that fade one after the other: without one of them being sent again."""
+"""Random parts of a cloud: a fade shows and hides them, and sends nothing again."""
 CUT_SHARE = 0.04
-"""Thickness of a cut, of the size of what is cut."""
+"""Half the thickness of a cut, as a share of the size of what is cut."""
 POINT_SHARE = 0.5
-"""How large a point is drawn, of the distance between points spread evenly over a square of the cloud's size."""
+"""Size of a point, as a share of the distance between points spread evenly over a square of the cloud's size."""
 LARGEST_POINT = 0.015
-"""Of the cloud's size."""
+"""Size of a point at most, as a share of the cloud's."""
+PICK_SHARE = 0.02
+"""Size of a clicked point, as a share of the scene's."""
 NAMES = ("first", "second", "solved")
 
 
 class Closeup:
-    """Draws what `shown_pair` gives; what is drawn already is moved, shown and hidden, not sent again."""
+    """Draws the pair that `shown_pair` gives; clouds that are drawn already are moved, shown and hidden, not sent."""
 
     def __init__(self, session: Session, server: Any) -> None:
         self._session, self._scene = session, server.scene
@@ -37,7 +39,7 @@ class Closeup:
         self._scene.add_frame("/pair", show_axes=False)
 
     def draw(self, pair: Shown | None, clouds: CloudSet | None, up: Floats, size: float) -> None:
-        """Show the two clouds; nothing where there are none. `size` is that of the whole scene."""
+        """Show the two clouds, or nothing where there are none; `up (3,)` and `size` are the scene's."""
         if pair is None or clouds is None:
             for name in (*NAMES, "picks"):
                 self._remove(name)
@@ -54,7 +56,7 @@ class Closeup:
         self._picks(pair.picks(), size)
 
     def _cloud(self, name: str, pair: Shown, clouds: CloudSet, row: int, colour: Any, pose: Floats, up: Floats) -> None:
-        """A node at the middle of a cloud, its points below it in parts; sent where they are other points."""
+        """A node at the middle of a cloud at a pose, with its points in slices; sent only if these points changed."""
         middle, size_m = extent(clouds[row])
         placing = pair.is_placed and name == "second"
         cut = () if pair.cut is None else (pair.cut, *pose.reshape(-1))
@@ -76,7 +78,7 @@ class Closeup:
         self._nodes[name].wxyz, self._nodes[name].position = placed(here)
 
     def _gizmo(self, size_m: float) -> Any:
-        """Handles that move the second cloud; where they are let go of is the candidate's guess."""
+        """Handles that move the second cloud; the pose at which they are let go becomes the candidate's guess."""
         gizmo = self._scene.add_transform_controls(_at("second"), scale=size_m, depth_test=False)
 
         def moved(event: Any) -> None:
@@ -89,13 +91,14 @@ class Closeup:
         return gizmo
 
     def _picks(self, picks: Floats, size: float) -> None:
+        """The clicked points (N, 3) in the world; nothing is sent where they are the same as before."""
         if self._drawn.get("picks") == (picks.tobytes(),):
             return
         self._remove("picks")
         self._drawn["picks"] = (picks.tobytes(),)
         if len(picks):
             self._nodes["picks"] = self._scene.add_point_cloud(
-                _at("picks"), picks, PICKED, point_size=0.02 * size, point_shape="circle", precision="float32"
+                _at("picks"), picks, PICKED, point_size=PICK_SHARE * size, point_shape="circle", precision="float32"
             )
 
     def _remove(self, name: str) -> None:
@@ -109,7 +112,7 @@ def _at(name: str) -> str:
 
 
 def _some(clouds: CloudSet, row: int) -> Floats32:
-    """The points of a cloud in random order, no more than are shown."""
+    """At most `MOST_POINTS` points of a cloud, in random order."""
     points = np.asarray(clouds[row].points_in_cam)
     return points[np.random.default_rng(0).permutation(len(points))[:MOST_POINTS]]
 

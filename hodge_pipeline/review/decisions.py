@@ -1,4 +1,4 @@
-"""Decisions about edges: kept as `hodge edit` keeps them, each with a line in a log; a stale one is refused."""
+"""Decisions about edges: stored as `hodge edit` stores them, with a log; a decision on an old state is refused."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COLUMNS = ("time", "who", "decision", "pairs", "verdict", "score", "residual_m",
 
 
 class StaleError(HodgeError):
-    """A decision was made on a page that did not show the latest state."""
+    """A decision came from a page that did not show the latest state."""
 
 
 class LockedError(HodgeError):
@@ -27,8 +27,8 @@ class LockedError(HodgeError):
 
 
 @dataclass(frozen=True)
-class Said:
-    """Who takes a decision, when (UTC, ISO 8601), why, and what was known of its edges."""
+class LogEntry:
+    """Who decided, when (UTC, ISO 8601), why (`note`), and the facts of the worst edge at that time."""
 
     who: str = ""
     time: str = ""
@@ -40,10 +40,10 @@ class Said:
 
 
 class Decisions:
-    """The history of decisions in a file, at a revision that grows with each change, whoever makes it.
+    """The history of decisions in a file, with a revision that grows with each change, whoever makes it.
 
-    Each change takes the revision that its maker saw: a stale one raises `StaleError`, and so does the first after the
-    file was changed by another program. What is written is on disk when a method returns.
+    Each change states the revision that its maker saw: an old one raises `StaleError`, and so does the first change
+    after another program changed the file. What is written is on disk when a method returns.
     """
 
     def __init__(self, file: Path, log: Path, *, run_folder: Path | None, locked: str = "") -> None:
@@ -54,11 +54,11 @@ class Decisions:
 
     @property
     def can_redo(self) -> bool:
-        """Whether an edit was taken back since the last one, by this process."""
+        """Whether this process undid an edit, and added none since."""
         return bool(self._undone)
 
     def why_locked(self) -> str:
-        """Why no decision can be taken now; empty where one can."""
+        """Why no decision can be taken now; "" where one can."""
         try:
             with _held(self._run_folder):
                 return self._locked
@@ -66,7 +66,7 @@ class Decisions:
             return self._locked or str(error)
 
     def refresh(self) -> bool:
-        """Read the file again; whether another program has changed it."""
+        """Read the file again, and tell whether another program has changed it."""
         found = read_history_file(self._file)
         if found == self.history:
             return False
@@ -74,33 +74,29 @@ class Decisions:
         self.revision += 1
         return True
 
-    def add(self, revision: int, edit: Edit, said: Said) -> None:
-        """One more decision. Raises `StaleError`, `LockedError`, `WorkspaceError`."""
+    def add(self, revision: int, edit: Edit, entry: LogEntry) -> None:
+        """Add a decision. Raises `StaleError`, `LockedError`, `WorkspaceError`."""
         with self._changing(revision):
-            self._put(self.history.added(edit), "", edit, said)
+            self._put(self.history.added(edit), "", edit, entry)
             self._undone = []
 
-    def undo(self, revision: int, said: Said) -> None:
-        """Take the latest decision that counts back. Raises as `add`, and `GraphError` where there is none."""
+    def undo(self, revision: int, entry: LogEntry) -> None:
+        """Undo the latest decision that counts. Raises as `add`, and `GraphError` where there is none."""
         with self._changing(revision):
             row = self.history.latest
             undone = self.history.undo()
             assert row is not None
-            self._put(undone, "undo ", self.history.edits[row], said)
+            self._put(undone, "undo ", self.history.edits[row], entry)
             self._undone.append(row)
 
-    def redo(self, revision: int, said: Said) -> None:
-        """Let the decision that was taken back last count again. Raises as `undo`."""
+    def redo(self, revision: int, entry: LogEntry) -> None:
+        """Redo the decision that was undone last. Raises as `undo`."""
         with self._changing(revision):
             if not self._undone:
                 raise GraphError("there is nothing to redo")
             again = self.history.redo(self._undone[-1])
-            self._put(again, "redo ", again.edits[self._undone[-1]], said)
+            self._put(again, "redo ", again.edits[self._undone[-1]], entry)
             self._undone.pop()
-
-    def note(self, text: str, said: Said) -> None:
-        """A line in the log that is no edit."""
-        self._append([said.time, said.who, text, "", "", "", "", "", said.note])
 
     def lines(self) -> list[dict[str, str]]:
         """The log, oldest first."""
@@ -110,6 +106,7 @@ class Decisions:
 
     @contextmanager
     def _changing(self, revision: int) -> Iterator[None]:
+        """While the body runs no run uses the folder, and the history is that of this revision."""
         if self._locked:
             raise LockedError(self._locked)
         with _held(self._run_folder):
@@ -124,7 +121,7 @@ class Decisions:
                 )
             yield
 
-    def _put(self, history: History, prefix: str, edit: Edit, said: Said) -> None:
+    def _put(self, history: History, prefix: str, edit: Edit, entry: LogEntry) -> None:
         try:
             write_history_file(self._file, history)
         except OSError as error:
@@ -133,8 +130,8 @@ class Decisions:
         self.revision += 1
         pairs = {verb: names for verb in VERBS if (names := getattr(edit, verb))}
         named = " ".join(name for names in pairs.values() for name in names)
-        known = (said.verdict, said.score, said.residual_m, said.residual_deg)
-        self._append([said.time, said.who, prefix + " ".join(pairs), named, *known, said.note])
+        known = (entry.verdict, entry.score, entry.residual_m, entry.residual_deg)
+        self._append([entry.time, entry.who, prefix + " ".join(pairs), named, *known, entry.note])
 
     def _append(self, cells: Sequence[str]) -> None:
         header = [] if self._log.exists() else [COLUMNS]
@@ -148,6 +145,7 @@ class Decisions:
 
 @contextmanager
 def _held(folder: Path | None) -> Iterator[None]:
+    """While the body runs no run uses the folder, where there is one. Raises `LockedError` where one does."""
     with ExitStack() as stack:
         if folder is not None:
             try:

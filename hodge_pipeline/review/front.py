@@ -1,4 +1,8 @@
-"""The only door of a review: 127.0.0.1, and not a byte for a request without its token, from another host or origin."""
+"""The HTTP server of a review, on 127.0.0.1: a page, its data and, behind it, the 3-D viewer.
+
+Whoever can send a request can decide. So every request must carry the secret token in its path, and name this server as
+its host, and as its origin where it states one: that stops other users, other pages and DNS rebinding.
+"""
 
 from __future__ import annotations
 
@@ -22,26 +26,28 @@ from hodge_pipeline.store.artifacts import json_text
 
 HOST = "127.0.0.1"
 HEAD_S = 30.0
-"""Seconds that a request's head may take."""
+"""Seconds that a request may take to arrive."""
 MOST_BYTES = 1 << 18
-"""Of a request's body: a decision about 5000 edges is 40 kB."""
+"""Bytes of a request's body at most: a decision about 5000 edges is 40 kB."""
 BEAT_S = 10.0
-"""Seconds between two lines of the stream of events, so that one whose page has gone is noticed."""
+"""Seconds between two lines of the stream of events at most: a write shows that a page has gone."""
 CHUNK = 1 << 16
-OURS = (
+"""Bytes passed on at once."""
+PAGE_POLICY = (
     "default-src 'self'; img-src 'self' data: blob:; frame-src 'self'; frame-ancestors 'none'; base-uri 'none'; "
     "form-action 'none'"
 )
-VIEWER = (
+VIEWER_POLICY = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' ws://{host} data: blob:; "
     "frame-ancestors 'self'; base-uri 'none'; form-action 'none'"
 )
+"""Content security policies: of our page, and of viser's, which needs inline scripts and its socket."""
 REFUSED = {HodgeError: HTTPStatus.BAD_REQUEST, LockedError: HTTPStatus.LOCKED, StaleError: HTTPStatus.CONFLICT}
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a route gives: bytes of a content type, as a file to keep where it has a `name`."""
+    """What a route gives: bytes of a content type; with a `name` they are a file to download."""
 
     body: bytes
     content_type: str = "application/json"
@@ -58,8 +64,11 @@ Route = Callable[[dict[str, Any]], Answer]
 
 @dataclass(frozen=True)
 class Site:
-    """What stands behind the door: routes by method and name; `wait` gives the state after a version, within some
-    seconds; the socket of the 3-D viewer, None where there is none.
+    """What the server serves.
+
+    - `routes` by method and name.
+    - `wait(version, seconds)`: the next version and its state; the same version again once the seconds are over.
+    - `viewer`: the Unix socket of the 3-D viewer, None without one.
     """
 
     routes: Mapping[tuple[str, str], Route]
@@ -68,7 +77,7 @@ class Site:
 
 
 class Front:
-    """A server of a site on this machine; `address` holds its token. Raises `WorkspaceError` for a taken port."""
+    """Serves a site in threads of its own; `port` 0 takes a free one. Raises `WorkspaceError` for a taken port."""
 
     def __init__(self, site: Site, port: int = 0) -> None:
         self.token = secrets.token_urlsafe(24)
@@ -86,11 +95,11 @@ class Front:
 
     @property
     def address(self) -> str:
-        """Where the page is."""
+        """The URL of the page, which holds the token."""
         return f"http://{HOST}:{self.port}/{self.token}/"
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop serving."""
         self._server.closing.set()
         self._server.shutdown()
         self._server.server_close()
@@ -118,7 +127,7 @@ class _Handler(BaseHTTPRequestHandler):
         return "hodge"
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing: the address holds the token."""
+        """Nothing: the path holds the token."""
 
     def do_GET(self) -> None:
         self._serve("GET")
@@ -139,7 +148,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._route(method, name)
 
     def _admitted(self) -> str | None:
-        """What the request asks for; None where it is not let in."""
+        """The name in the path, without the token; None where token, host or origin is wrong."""
         hosts, origin = self.server.hosts, self.headers.get("Origin")
         token, _, name = urlsplit(self.path).path.removeprefix("/").partition("/")
         is_ours = self.headers.get_all("Host") is not None and all(h in hosts for h in self.headers.get_all("Host", []))
@@ -177,17 +186,15 @@ class _Handler(BaseHTTPRequestHandler):
     def _send(self, status: HTTPStatus, answer: Answer) -> None:
         with suppress(ConnectionError):
             self.send_response(status)
-            self._say("Content-Type", answer.content_type)
-            self._say("Content-Length", str(len(answer.body)))
+            self.send_header("Content-Type", answer.content_type)
+            self.send_header("Content-Length", str(len(answer.body)))
             if answer.name:
-                self._say("Content-Disposition", f'attachment; filename="{answer.name}"')
-            self._guards(OURS)
+                self.send_header("Content-Disposition", f'attachment; filename="{answer.name}"')
+            self._end_headers(PAGE_POLICY)
             self.wfile.write(answer.body)
 
-    def _say(self, name: str, value: str) -> None:
-        self.send_header(name, value)
-
-    def _guards(self, policy: str) -> None:
+    def _end_headers(self, policy: str) -> None:
+        """Send what every answer is guarded by, and end the head."""
         for name, value in (
             ("Content-Security-Policy", policy),
             ("Referrer-Policy", "no-referrer"),
@@ -195,17 +202,17 @@ class _Handler(BaseHTTPRequestHandler):
             ("Cross-Origin-Resource-Policy", "same-origin"),
             ("Cache-Control", "no-store"),
         ):
-            self._say(name, value)
+            self.send_header(name, value)
         if self.close_connection:
-            self._say("Connection", "close")
+            self.send_header("Connection", "close")
         self.end_headers()
 
     def _events(self) -> None:
-        """The state, again after each change, until the page has gone."""
+        """Server-sent events: the state, again after each change, until the page has gone."""
         self.close_connection = True
         self.send_response(HTTPStatus.OK)
-        self._say("Content-Type", "text/event-stream")
-        self._guards(OURS)
+        self.send_header("Content-Type", "text/event-stream")
+        self._end_headers(PAGE_POLICY)
         version = -1
         with suppress(OSError):
             while not self.server.closing.is_set():
@@ -216,7 +223,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self.wfile.flush()
 
     def _proxy(self, path: str) -> None:
-        """Hand an admitted request to the viewer, and its answer back."""
+        """Pass an admitted request on to the viewer, and its answer back; a WebSocket in both directions."""
         self.close_connection = True
         if self.server.site.viewer is None:
             self._send(HTTPStatus.NOT_FOUND, Answer(b"no viewer\n", "text/plain"))
@@ -232,6 +239,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self._pass_on(viewer)
 
     def _head(self, path: str, upgrade: bool) -> bytes:
+        """The request's head for the viewer, without what concerns this connection alone."""
         dropped = ("connection", "keep-alive", "proxy-connection", "transfer-encoding", "content-length")
         kept = [(name, value) for name, value in self.headers.items() if name.lower() not in dropped]
         kept.append(("Connection", "Upgrade" if upgrade else "close"))
@@ -239,7 +247,7 @@ class _Handler(BaseHTTPRequestHandler):
         return "\r\n".join(lines).encode("latin-1")
 
     def _pass_on(self, viewer: socket.socket) -> None:
-        """The viewer's answer, under our own head."""
+        """The viewer's answer, under our own headers."""
         answer = b"".join(iter(lambda: viewer.recv(CHUNK), b""))
         head, _, body = answer.partition(b"\r\n\r\n")
         status, *lines = head.decode("latin-1").split("\r\n")
@@ -247,9 +255,9 @@ class _Handler(BaseHTTPRequestHandler):
         for line in lines:
             name, _, value = line.partition(":")
             if name.lower() in ("content-type", "content-encoding"):
-                self._say(name, value.strip())
-        self._say("Content-Length", str(len(body)))
-        self._guards(VIEWER.format(host=self.headers["Host"]))
+                self.send_header(name, value.strip())
+        self.send_header("Content-Length", str(len(body)))
+        self._end_headers(VIEWER_POLICY.format(host=self.headers["Host"]))
         self.wfile.write(body)
 
 
@@ -262,6 +270,7 @@ def _both_ways(first: socket.socket, second: socket.socket) -> None:
 
 
 def _copy(source: socket.socket, target: socket.socket) -> None:
+    """Copy bytes until the source ends, then shut both down: that wakes whoever still reads one of them."""
     with suppress(OSError):
         while data := source.recv(CHUNK):
             target.sendall(data)

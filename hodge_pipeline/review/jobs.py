@@ -1,4 +1,4 @@
-"""Work that a page does not wait for: one thread, one job of a kind at a time, the latest asked for."""
+"""Background work of a review: one thread, in which the latest job of each kind replaces one that still waits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Job = Callable[[], None]
 
 
 class Jobs:
-    """A thread that does what it is given, in order; a job of a kind that waits already takes that one's place."""
+    """A thread that runs jobs in order; a job replaces a waiting one of its kind. `failed` gets errors in words."""
 
     def __init__(self, name: str, failed: Callable[[str], None]) -> None:
         self._failed = failed
@@ -31,13 +31,13 @@ class Jobs:
             return self._doing or next(iter(self._waiting), "")
 
     def put(self, kind: str, job: Job) -> None:
-        """Do this when what was given before is done."""
+        """Run the job after those that wait already."""
         with self._changed:
             self._waiting[kind] = job
             self._changed.notify_all()
 
     def wait(self) -> None:
-        """Return when nothing is left to do."""
+        """Return when no job waits or runs."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or not (self._waiting or self._doing))
 

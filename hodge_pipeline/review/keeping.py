@@ -1,4 +1,4 @@
-"""What a review leaves beside its decisions: a pose graph or a COLMAP model in a new place, nothing written over."""
+"""Save what a review made: a pose graph or a COLMAP model under a new name, so that nothing is overwritten."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from hodge_pipeline.types.text import counted
 from hodge_pipeline.uses.model_folder import MODELS
 
 SAME_PX = 1e-3
-"""Less than keypoints are found to, and more than a bundle adjustment stops short by."""
+"""A smaller rise of the mean error is none: keypoints are less exact, bundle adjustment stops nearer to its optimum."""
 
 
 def save(session: Session) -> tuple[Path, str]:
-    """The new file or folder with the latest decisions solved, its decisions beside it, and what to know of it.
+    """Write the latest decisions, solved, with their history; the new file or folder, and a sentence on it.
 
     Raises `WorkspaceError` where it cannot be written.
     """
@@ -46,7 +46,7 @@ def save(session: Session) -> tuple[Path, str]:
 
 
 def _write_graph(path: Path, subject: Subject, graph: ViewGraph, world_from_cam: Floats) -> str:
-    """The edges that count, at their poses, as g2o."""
+    """Write the graph at these poses (V, 4, 4) as g2o; how many edges it has."""
     trajectory = Trajectory(np.arange(len(world_from_cam), dtype=float), world_from_cam)
     source = replace(subject.source, graph=graph, trajectory=trajectory)
     registry.load("writers", "g2o")().write(path, source)
@@ -54,7 +54,7 @@ def _write_graph(path: Path, subject: Subject, graph: ViewGraph, world_from_cam:
 
 
 def _write_model(path: Path, model: TrackedModel, world_from_body: Floats) -> str:
-    """The model at these poses after bundle adjustment, where `hodge refine colmap` puts its own."""
+    """Write the model, adjusted from these poses (B, 4, 4), as `hodge refine colmap` does; its errors in words."""
     done = model.moved(world_from_body).merged().adjusted()
     before, after = costs([model.quality], [done.quality])
     folder = path / MODELS / "0"
@@ -66,9 +66,7 @@ def _write_model(path: Path, model: TrackedModel, world_from_body: Floats) -> st
 
 
 def _free(subject: Subject) -> Path:
-    """A name beside the subject that nothing has: `graph.reviewed.g2o`, `graph.reviewed-2.g2o`, …; of a model a folder
-    `model.reviewed`, …
-    """
+    """An unused name beside the subject: `graph.reviewed.g2o`, `graph.reviewed-2.g2o`, …; `model.reviewed`, …"""
     path = subject.path.resolve()
     folder, stem, ending = path.parent, path.name if path.is_dir() else path.stem, ".g2o"
     if subject.model is not None:

@@ -1,26 +1,27 @@
-"""The table of edges that a page shows: filtered, sorted, a piece at a time; and all that is known of one edge."""
+"""What a page shows as JSON: the state, the table of edges in parts, filtered and sorted, and one edge in detail."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.diagnosis.wording import cycle_error, name_cycle
-from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.edits import pair_names
 from hodge_pipeline.report.advice import ORDER
+from hodge_pipeline.review.adding import Candidate
 from hodge_pipeline.review.session import Session
 from hodge_pipeline.review.settle import Judged
-from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types import Bools, Floats, Ints, Words
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class Query:
-    """Which edges, and in which order: `verdicts` (none: all), at least so many frames apart and metres off, those of
-    one frame; from the row `first` on.
+    """Which edges to list, in which order, and which part: `count` of them from the row `first` on.
+
+    `verdicts`: none means all; `min_gap` in frames between the ends; `frame`: edges of this vertex id alone.
     """
 
     verdicts: tuple[str, ...] = ()
@@ -34,7 +35,7 @@ class Query:
 
 
 def list_edges(session: Session, query: Query) -> dict[str, Any]:
-    """How many edges the query has, and some of them."""
+    """How many edges match the query (`total`), and the part of them that it asks for."""
     with session.changed:
         table, settled, judged = session.table, session.settled, session.judged
         switches = table.switches(session.decisions.history)
@@ -69,6 +70,7 @@ def list_edges(session: Session, query: Query) -> dict[str, Any]:
 
 
 def _wanted(session: Session, query: Query) -> Bools:
+    """The edges (E,) that match the query."""
     table, settled = session.table, session.settled
     pairs = table.graph.edges
     wanted = np.abs(pairs[:, 0] - pairs[:, 1]) >= query.min_gap
@@ -82,16 +84,17 @@ def _wanted(session: Session, query: Query) -> Bools:
 
 
 def _order(session: Session, query: Query, rows: Ints, failing: Ints) -> Ints:
-    """The order of rows, the worst first unless `descending` turns it round.
+    """The order of the rows, the worst first, or last where `descending`; `failing (E,)` counts cycles that fail.
 
-    Edges with the same score keep their order, that of the residuals at first, while decisions move the poses.
+    Ties of the score are broken by the residuals at the first poses, so that edges keep their places while decisions
+    move the poses.
     """
     edges, settled, pairs = session.table.edges, session.settled, session.table.graph.edges
     residual_m = np.nan_to_num(settled.residual_m[rows], nan=np.inf)
     first_m = np.full(len(edges), np.inf)
     first_m[: len(session.first.residual_m)] = np.nan_to_num(session.first.residual_m, nan=np.inf)
     keys: dict[str, tuple[Any, ...]] = {
-        "score": (-first_m[rows], _place(edges.probability[rows]), _ranks(edges.verdict[rows])),
+        "score": (-first_m[rows], _rounded(edges.probability[rows]), _ranks(edges.verdict[rows])),
         "residual": (-residual_m,),
         "turn": (-np.nan_to_num(settled.residual_rad[rows], nan=np.inf),),
         "gap": (-np.abs(pairs[rows, 0] - pairs[rows, 1]),),
@@ -102,17 +105,19 @@ def _order(session: Session, query: Query, rows: Ints, failing: Ints) -> Ints:
     return order[::-1] if query.descending else order
 
 
-def _place(score: Floats) -> Floats:
+def _rounded(score: Floats) -> Floats:
+    """Scores as the page shows them, so that equal ones tie; one that is unknown counts as undecided."""
     return np.asarray(np.nan_to_num(score, nan=0.5).round(2))
 
 
-def _ranks(verdict: np.ndarray[tuple[int, ...], Any]) -> Ints:
+def _ranks(verdict: Words) -> Ints:
+    """The place of each verdict in the order of the report, unknown ones last."""
     places = {name: place for place, name in enumerate(ORDER)}
     return np.array([places.get(str(one), len(places)) for one in verdict], np.int64)
 
 
 def cycle_counts(judged: Judged | None, count: int) -> tuple[Ints, Ints]:
-    """How many listed cycles pass each edge (E,), and how many of these close; zeros while nothing is judged."""
+    """How many cycles pass through each edge (E,), and how many of these close; zeros while nothing is judged."""
     passing, closing = np.zeros(count, np.int64), np.zeros(count, np.int64)
     if judged is not None:
         cycles, rows = judged.diagnosis.cycles, judged.rows
@@ -123,23 +128,31 @@ def cycle_counts(judged: Judged | None, count: int) -> tuple[Ints, Ints]:
 
 
 def describe(session: Session, edge: int) -> dict[str, Any]:
-    """What the page says of the edge that is selected: the cycles that close over it and those that fail, by frames."""
+    """The selected edge in detail: its cycles that close and that fail. Raises `GraphError` for no edge."""
     with session.changed:
         table, judged = session.table, session.judged
-    if not 0 <= edge < len(table):
-        raise GraphError(f"there is no edge {edge}: rows go from 0 to {len(table) - 1}")
-    said = session.subject.worded
-    cycles = [{"closes": closes, "text": text, "error": said(off)} for closes, text, off, _ in witnesses(session, edge)]
+    table.check_row(edge)
+    cycles = [
+        {"closes": one.closes, "text": one.frames, "error": session.subject.worded(one.error)}
+        for one in witnesses(session, edge)
+    ]
     (name,) = pair_names(table.graph.vertex_ids, table.graph.edges[[edge]])
     beside = len(table.rows[name])
     known = judged is not None and judged.row(edge) is not None
     return {"row": edge, "name": name, "cycles": cycles, "beside": beside, "known": known}
 
 
-def witnesses(session: Session, edge: int) -> list[tuple[bool, str, str, Ints]]:
-    """The cycles that speak for and against an edge: whether each closes, its frames, by how much it fails, and the
-    vertex rows along it.
-    """
+class Witness(NamedTuple):
+    """A cycle through an edge: whether it closes, its frames and error in words, and its vertex rows `along (n,)`."""
+
+    closes: bool
+    frames: str
+    error: str
+    along: Ints
+
+
+def witnesses(session: Session, edge: int) -> list[Witness]:
+    """The cycles for and against an edge; none while it is not judged."""
     judged, table = session.judged, session.table
     if judged is None or (row := judged.row(edge)) is None:
         return []
@@ -148,12 +161,13 @@ def witnesses(session: Session, edge: int) -> list[tuple[bool, str, str, Ints]]:
     for closes, telling in ((True, found.witnesses_for[row]), (False, found.witnesses_against[row])):
         for cycle in telling[telling >= 0].tolist():
             along = found.cycles.loops.select(np.array([cycle])).vertices(graph.edges)
-            out.append((closes, name_cycle(graph, found.cycles, cycle), cycle_error(found.cycles, cycle), along))
+            words = name_cycle(graph, found.cycles, cycle), cycle_error(found.cycles, cycle)
+            out.append(Witness(closes, *words, along))
     return out
 
 
 def state(session: Session) -> dict[str, Any]:
-    """All that a page shows beside the table."""
+    """All that a page shows beside the table; the keys are those that `page.js` reads."""
     with session.changed:
         table, settled, decisions = session.table, session.settled, session.decisions
         counted = settled.weights > 0
@@ -195,10 +209,11 @@ def state(session: Session) -> dict[str, Any]:
 
 
 def _name(session: Session, row: int) -> str:
+    """The id of a vertex, as the source has it."""
     return str(session.table.graph.vertex_ids[row])
 
 
-def _candidate(session: Session, candidate: Any) -> dict[str, Any]:
+def _candidate(session: Session, candidate: Candidate) -> dict[str, Any]:
     found = candidate.found
     return {
         "pair": f"{_name(session, candidate.i)}-{_name(session, candidate.j)}",
@@ -214,5 +229,5 @@ def _candidate(session: Session, candidate: Any) -> dict[str, Any]:
 
 
 def _number(value: Any) -> float | None:
-    """A number for JSON, which has no NaN."""
+    """A number of five digits for JSON, which has no NaN: None."""
     return float(f"{value:.5g}") if np.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""The two clouds that are looked at closely: where each lies, and which of their points are shown."""
+"""The pair of clouds that is looked at closely: their poses, and which of their points are shown."""
 
 from __future__ import annotations
 
@@ -12,16 +12,19 @@ from hodge_pipeline.review.session import Session
 from hodge_pipeline.types import Bools, Floats, Floats32, PointCloud
 
 APART = 1.15
-"""Clouds side by side are so many of their widths apart."""
+"""Distance of clouds side by side, in widths of the first."""
 EXTENT = 90
-"""Percentile of the distances from a cloud's middle that counts as its size."""
+"""Percentile of the distances from a cloud's middle that is its size: few points lie far out."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """Vertex rows of two clouds and the pose of each; that of the second as the edge has it and as the solution has
-    it, and which `share` of its points lies as the latter; the size of the first and where its middle is; a cut through
-    them; the candidate, and by which mode its guess is made.
+    """Two clouds in the world, as the scene draws them.
+
+    - `i`, `j`: vertex rows; `world_from_i`, and of the second cloud `world_from_j` by the edge and `solved_from_j`
+      (world_from_j too) by the solution, at which a `share` of its points is drawn.
+    - `middle (3,)`, `size_m`: of the first cloud in the world, or of both side by side.
+    - `mode`: one of `session.MODES`; `cut`: the height of a cut above the middle, in sizes; None: whole.
     """
 
     i: int
@@ -60,7 +63,7 @@ class Shown:
         return np.concatenate([se3.transform(self.world_from_i, first), se3.transform(self.world_from_j, second)])
 
     def kept(self, points: Floats32, world_from_cam: Floats, up: Floats, thickness: float) -> Bools:
-        """Which points (N, 3) of a cloud at a pose lie in the cut, `thickness` of the size thick."""
+        """Which points (N, 3) of a cloud at a pose lie in the cut across `up`; its half `thickness` is in sizes."""
         if self.cut is None:
             return np.ones(len(points), bool)
         heights = (se3.transform(world_from_cam, np.asarray(points, float)) - self.middle) @ up
@@ -68,7 +71,7 @@ class Shown:
 
 
 def shown_pair(session: Session, flip: bool) -> Shown | None:
-    """What is looked at closely; None where the whole scene is. `flip` shows the other side of what blinks."""
+    """The candidate or selected edge as it is looked at; None: the whole scene. `flip`: a blink shows the solution."""
     look, clouds = session.look, session.subject.clouds
     if look.mode == "all" or clouds is None:
         return None
@@ -92,13 +95,13 @@ def shown_pair(session: Session, flip: bool) -> Shown | None:
 
 
 def extent(cloud: PointCloud) -> tuple[Floats, float]:
-    """The middle of a cloud, in its camera's axes, and its size, at least a millimetre."""
+    """The middle (3,) of a cloud in its camera's axes and its size, at least a millimetre."""
     middle, size_m = ball(np.asarray(cloud.points_in_cam, float))
     return middle, max(size_m, 1e-3)
 
 
 def ball(points: Floats) -> tuple[Floats, float]:
-    """The middle of points (N, 3) and the distance from it within which most lie; 1 where they are one or none."""
+    """The median (3,) of points (N, 3) and the distance within which `EXTENT` per cent lie; 1 where that is 0."""
     if not len(points):
         return np.zeros(3), 1.0
     middle = np.median(points, axis=0)

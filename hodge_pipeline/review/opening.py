@@ -1,4 +1,4 @@
-"""Open a review: the session, its scene and its door."""
+"""Open a review: its session, its 3-D scene and its server."""
 
 from __future__ import annotations
 
@@ -27,8 +27,9 @@ MISSING = "hodge review needs viser: pip install 'hodge-pipeline[review]'"
 
 
 class Review:
-    """A review that is open: its `session`, its 3-D `viewer` and the `address` of its page. Closed by `close`, or as a
-    context.
+    """An open review: its `session`, its 3-D `viewer` and the `address` of its page; a context that closes it.
+
+    `scene`: whether there is a 3-D viewer; `who` the log names, by default the user of this process.
     """
 
     def __init__(self, path: Path, *, port: int = 0, scene: bool = True, who: str | None = None) -> None:
@@ -47,7 +48,7 @@ class Review:
 
     @property
     def address(self) -> str:
-        """Where the page is; whoever has it can decide."""
+        """The URL of the page; whoever has it can decide."""
         return self._front.address
 
     def wait(self) -> None:
@@ -56,7 +57,7 @@ class Review:
             threading.Event().wait()
 
     def close(self) -> None:
-        """Serve no more. Every decision is on disk already."""
+        """Stop serving; every decision is on disk already."""
         self._stack.close()
 
     def __enter__(self) -> Review:
@@ -85,7 +86,7 @@ def open_review(run: Run | Path | str, *, port: int = 0, browser: bool = True) -
 
 @contextmanager
 def _alone(path: Path) -> Iterator[None]:
-    """While the body runs no other review of this path is open. Raises `WorkspaceError` where one is already."""
+    """While the body runs no other review of this path can be opened. Raises `WorkspaceError` where one is open."""
     try:
         held = os.open(path, os.O_RDONLY)
     except OSError as error:
@@ -113,7 +114,7 @@ class Viewer:
 
         class Private(viser.ViserServer):
             def request_share_url(self, verbose: bool = True) -> str | None:
-                """Nothing: it would publish the scene on a server of viser's authors."""
+                """None: viser's own would publish the scene on a server of its authors."""
                 return None
 
         self._folder = tempfile.TemporaryDirectory(prefix="hodge-review-")
@@ -135,7 +136,7 @@ class Viewer:
 
 @contextlib.contextmanager
 def _listening_on(path: Path) -> Iterator[None]:
-    """While viser starts, what it calls to listen on a port listens on this socket: it has no option for that."""
+    """While the body runs websockets listens on this Unix socket in place of a port: viser has no option for that."""
     from websockets.asyncio import server
 
     original = server.serve
@@ -152,6 +153,6 @@ def _listening_on(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
-    """Viser prints an address that nobody can open."""
+    """While the body runs nothing is printed: viser prints an address that nobody can open."""
     with contextlib.redirect_stdout(io.StringIO()):
         yield

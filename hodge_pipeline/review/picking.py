@@ -1,4 +1,4 @@
-"""What a click in the scene means: the nearest line or point to its ray."""
+"""What a click in the scene hits: the line or point seen nearest to its ray."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from hodge_pipeline.types import Floats
 
 REACH_RAD = np.deg2rad(1.2)
-"""How far beside the ray of a click a line or point may be seen: 15 pixels of a view 60° and 750 pixels high."""
+"""Angle from the ray within which a click hits: 15 pixels of a view that is 60° and 750 pixels high."""
 
 
 def nearest_point(origin: Floats, direction: Floats, points: Floats) -> int | None:
@@ -47,7 +47,7 @@ def _seen(origin: Floats, ray: Floats, points: Floats) -> tuple[Floats, Floats]:
 
 
 def _nearest(angle: Floats, ahead: Floats) -> int | None:
-    """The row with the least angle; of those seen at nearly the same place the nearest."""
+    """The row with the least angle; among rows within an eighth of the reach of it, the nearest ahead."""
     within = np.flatnonzero((angle < REACH_RAD) & (ahead > 0))
     if not len(within):
         return None

@@ -1,4 +1,4 @@
-"""What a page of a review can ask for, by name."""
+"""The routes of a review's page: what it can ask for and do, by name."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from importlib.resources import as_file, files
+from pathlib import Path
 from threading import Lock
 from typing import Any
 
@@ -33,17 +34,18 @@ FILES = {
     "page.css": ("page.css", "text/css; charset=utf-8"),
 }
 SUGGESTED = 12
+"""Pairs that are suggested."""
 QUERY = TypeAdapter(Query)
 Asked = dict[str, Any]
-
-KEPT = 8
+"""The parameters of a request, not checked yet."""
+PICTURES_KEPT = 8
 """Edges whose pictures are kept, 150 kB each."""
 
 
-def site(session: Session, viewer: Any = None) -> Site:
-    """The site of a session; `viewer` is the path of the socket of its 3-D viewer."""
+def site(session: Session, viewer: Path | None = None) -> Site:
+    """The site of a session; `viewer` is the Unix socket of its 3-D viewer."""
     routes: dict[tuple[str, str], Route] = {("GET", name): _file(*found) for name, found in FILES.items()}
-    routes |= {("GET", name): route for name, route in _shown(session).items()}
+    routes |= {("GET", name): route for name, route in _views(session).items()}
     routes |= {("POST", name): _then_state(session, action) for name, action in _actions(session).items()}
 
     def wait(version: int, seconds: float) -> tuple[int, dict[str, Any]]:
@@ -60,16 +62,19 @@ def _file(name: str, content_type: str) -> Route:
     return lambda _: Answer(body, content_type)
 
 
-def _then_state(session: Session, action: Callable[[Asked], Any]) -> Route:
+def _then_state(session: Session, action: Callable[[Asked], None]) -> Route:
+    """A route that does this and answers with the state."""
+
     def route(asked: Asked) -> Answer:
-        told = action(asked)
-        return Answer.json({"state": state(session), **({} if told is None else {"told": told})})
+        action(asked)
+        return Answer.json({"state": state(session)})
 
     return route
 
 
-def _shown(session: Session) -> Mapping[str, Route]:
-    pictures = Pictures(session)
+def _views(session: Session) -> Mapping[str, Route]:
+    """What a page can ask for, by GET."""
+    pictures = EdgePictures(session)
 
     def edge(asked: Asked) -> Answer:
         row = _whole(asked, "row")
@@ -98,11 +103,13 @@ def _shown(session: Session) -> Mapping[str, Route]:
 
 
 def _opened(session: Session) -> Answer:
+    """The state for a page that was just opened: another program may have changed the edits before."""
     session.refresh()
     return Answer.json(state(session))
 
 
-def _actions(session: Session) -> Mapping[str, Callable[[Asked], Any]]:
+def _actions(session: Session) -> Mapping[str, Callable[[Asked], None]]:
+    """What a page can do, by POST."""
     return {
         "decide": lambda asked: session.decide(
             _whole(asked, "revision"), str(asked.get("verb")), _rows(asked), _note(asked)
@@ -120,12 +127,12 @@ def _actions(session: Session) -> Mapping[str, Callable[[Asked], Any]]:
 
 
 def finish(session: Session) -> None:
-    """Solve and fuse a run again with its decisions, or write a graph or a model, while the pages go on."""
+    """Solve and fuse a run again with its decisions, or write a graph or a model, in the background."""
     subject = session.subject
 
     def fuse() -> None:
         session.quick.wait()
-        solve_again(subject.path, watcher=_Told(session))
+        solve_again(subject.path, watcher=_StageMessages(session))
         session.reopen(subject.path)
         session.say("solved and fused: this is the run as it is now")
 
@@ -137,14 +144,14 @@ def finish(session: Session) -> None:
     session.bump()
 
 
-class _Told:
-    """A watcher that tells the pages which stage is at work."""
+class _StageMessages:
+    """A watcher that tells the pages which stage runs."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
 
     def stage(self, title: str, total: int) -> AbstractContextManager[Advance]:
-        """A context that tells the stage's title."""
+        """Tell the stage's title; its progress is not shown."""
         self._session.say(f"hodge solve: {title}")
         return nullcontext(lambda *_: None)
 
@@ -166,6 +173,7 @@ def suggestions(session: Session) -> list[dict[str, Any]]:
 
 
 def _whole(asked: Asked, key: str) -> int:
+    """The whole number of this name. Raises `GraphError` where it is none."""
     try:
         return int(asked[key])
     except (KeyError, TypeError, ValueError):
@@ -184,6 +192,7 @@ def _note(asked: Asked) -> str:
 
 
 def _query(asked: Asked) -> Query:
+    """The query of a request, its verdicts joined by commas. Raises `GraphError` for an unknown or wrong option."""
     verdicts = tuple(word for word in str(asked.get("verdicts", "")).split(",") if word)
     try:
         return QUERY.validate_python({key: value for key, value in asked.items() if value} | {"verdicts": verdicts})
@@ -193,6 +202,7 @@ def _query(asked: Asked) -> Query:
 
 
 def _look(asked: Asked) -> dict[str, Any]:
+    """The changes of `session.Look` that a request asks for. Raises `GraphError` for an unknown mode."""
     changes: dict[str, Any] = {}
     if "mode" in asked:
         if asked["mode"] not in MODES:
@@ -208,7 +218,7 @@ def _look(asked: Asked) -> dict[str, Any]:
 
 
 def _frames(session: Session, asked: Asked) -> list[int]:
-    """The rows of frames, given as such or named as the table names them."""
+    """Vertex rows, given as `rows` or by the ids that the table shows. Raises `GraphError` for an unknown id."""
     if "rows" in asked:
         return [row for row in _rows(asked) if 0 <= row < session.table.graph.vertex_count]
     names: Sequence[Any] = asked.get("frames") or ()
@@ -219,8 +229,8 @@ def _frames(session: Session, asked: Asked) -> list[int]:
     return [rows[str(name)] for name in names]
 
 
-class Pictures:
-    """The pictures of edges at the present poses, made when they are first asked for."""
+class EdgePictures:
+    """The pictures of edges at the present poses, made when they are first asked for; the last few are kept."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -228,13 +238,12 @@ class Pictures:
         self._lock = Lock()
 
     def of(self, row: int) -> tuple[Picture, ...]:
-        """The pictures of an edge; none where nothing is judged yet. Raises `GraphError` for a row without an edge."""
+        """The pictures of an edge; none while nothing is judged. Raises `GraphError` for a row without an edge."""
         with self._session.changed:
             subject, table, settled, judged = (
                 self._session.subject, self._session.table, self._session.settled, self._session.judged,
             )  # fmt: skip
-        if not 0 <= row < len(table):
-            raise GraphError(f"there is no edge {row}: rows go from 0 to {len(table) - 1}")
+        table.check_row(row)
         if judged is None:
             return ()
         key = id(subject), settled.revision, row
@@ -244,12 +253,13 @@ class Pictures:
                 found = edge_pictures(
                     table.graph, poses, np.array([row]), subject.frames, subject.clouds, has_metres=subject.unit == "m"
                 )
-                plots = tuple(_told(plot) for one in found for plot in one.plots)
+                plots = tuple(_with_title(plot) for one in found for plot in one.plots)
                 self._made[key] = plots
-                while len(self._made) > KEPT:
+                while len(self._made) > PICTURES_KEPT:
                     self._made.popitem(last=False)
             return self._made[key]
 
 
-def _told(plot: Picture) -> Picture:
+def _with_title(plot: Picture) -> Picture:
+    """The picture with the title of what it is drawn at: the diagnosis draws at its robust poses."""
     return replace(plot, title=plot.title.replace("robust poses say", "solution says"))

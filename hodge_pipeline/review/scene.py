@@ -1,4 +1,4 @@
-"""The scene of a review: clouds, cameras, edges in the colour of their verdict, and the edge that is looked at."""
+"""The 3-D scene of a review: clouds, cameras, edges in the colours of their verdicts, and the pair looked at."""
 
 from __future__ import annotations
 
@@ -21,19 +21,21 @@ from hodge_pipeline.types import CloudSet, Floats, Floats32, Ints
 
 COLOURS = {verdict: tuple(bytes.fromhex(colour[1:])) for verdict, colour in REPORTED.items()}
 SELECTED, BEFORE = (190, 0, 190), (170, 170, 200)
+"""Colours of the selected edge, and of the way from where a camera was before the latest decision."""
 MOST_POINTS = 3_000_000
-"""Of the overview: 9 bytes each, 27 MB for a page to receive."""
+"""Points of the overview: 9 bytes each, 27 MB for a page to receive."""
 SAMPLED = 3000
-"""Points that tell where the scene lies."""
+"""Points by which the scene is centred."""
 CROWD = 200
-"""Cameras above which they are drawn smaller, lest they hide the edges."""
+"""Cameras above which they are drawn smaller, so that they do not hide the edges."""
 BLINK_S = 0.6
+"""Seconds from one side of a blink to the other."""
 BARELY = 1e-7
-"""A pose that changed by less stays where it is drawn."""
+"""Change of a pose's numbers below which nothing is sent."""
 
 
 class Scene:
-    """Draws a session with viser, and turns clicks into selections; a thread of its own follows the session."""
+    """Draws a session with viser and turns clicks into selections; a thread of its own follows the session."""
 
     def __init__(self, session: Session, server: Any) -> None:
         self._session, self._server = session, server
@@ -53,13 +55,13 @@ class Scene:
         self._thread.start()
 
     def close(self) -> None:
-        """Draw no more."""
+        """End the thread that draws."""
         self._closed.set()
         self._session.bump()
         self._thread.join()
 
     def _begin(self) -> None:
-        """The scene of a subject that was just opened."""
+        """Draw a subject that was just opened, with all its clouds."""
         scene, poses = self._server.scene, self._session.settled.world_from_cam
         self._eye: tuple[int, int, int] | None = None
         self._first_look(self.overview(poses))
@@ -73,6 +75,7 @@ class Scene:
         self._poses, self._before = poses.copy(), (0, poses)
 
     def _add_clouds(self, clouds: CloudSet, poses: Floats) -> None:
+        """Send the clouds, thinned; points are drawn 1 cm large at least where lengths are metres."""
         step = thinning(clouds.offsets, MOST_POINTS)
         size = max(0.004 * self._size, 0.01 if self._subject.unit == "m" else 0.0)
         for row in range(len(clouds)):
@@ -85,6 +88,7 @@ class Scene:
                 )  # fmt: skip
 
     def _follow(self) -> None:
+        """Draw after every change of the session; while it blinks also between changes, the other side each time."""
         session, version, flip = self._session, -1, False
         while not self._closed.is_set():
             with session.changed:
@@ -97,7 +101,10 @@ class Scene:
                 self.draw(flip)
 
     def overview(self, poses: Floats) -> tuple[Floats, Floats]:
-        """Where the whole scene is seen from at these poses, and its middle; up and its size follow from them too."""
+        """The position (3,) that shows the whole scene at poses (V, 4, 4), and its middle (3,); sets up and size too.
+
+        The view is from behind and above: 1.8 sizes up and 1.3 back show the scene in viser's field of view.
+        """
         known = poses[np.isfinite(poses).all(axis=(1, 2))]
         _, radius = ball(known[:, :3, 3])
         self._size = max(radius, 0.5) if self._subject.unit == "m" else radius
@@ -107,7 +114,7 @@ class Scene:
         return centre + max(radius, self._size) * (1.8 * self._up - 1.3 * ahead), centre
 
     def _first_look(self, view: tuple[Floats, Floats]) -> None:
-        """Where a page that comes sees from, and what it looks at."""
+        """Set the camera of pages that connect: its position and what it looks at."""
         self._server.initial_camera.position, self._server.initial_camera.look_at = map(tuple, view)
 
     def draw(self, flip: bool = False) -> None:
@@ -133,7 +140,7 @@ class Scene:
             chosen = table.graph.edges[[look.selected]] if look.selected >= 0 else np.zeros((0, 2), np.int64)
             self._lines("/edges/selected", settled.world_from_cam, chosen, SELECTED, 6.0)
             for closes, name, colour in ((True, "closing", COLOURS[CONSISTENT]), (False, "failing", COLOURS[WRONG])):
-                around = [_around(along) for good, _, _, along in cycles if good == closes]
+                around = [_around(one.along) for one in cycles if one.closes == closes]
                 self._lines(f"/cycles/{name}", settled.world_from_cam, _joined(around), colour, 3.5)
             scene = self._server.scene
             scene.add_frame("/clouds", show_axes=False, visible=pair is None)
@@ -141,7 +148,7 @@ class Scene:
         self._turn_to(pair, look.home)
 
     def _move(self, poses: Floats, revision: int) -> None:
-        """The clouds at new poses, and a line from where each camera was before the latest decision."""
+        """Move the clouds to poses (V, 4, 4), and draw a line from where each camera was before the latest decision."""
         if np.array_equal(poses, self._poses, equal_nan=True):
             return
         for row in np.flatnonzero(np.abs(poses - self._poses).max(axis=(1, 2)) > BARELY).tolist():
@@ -154,6 +161,7 @@ class Scene:
         self._draw_lines("/before", ways[np.ptp(ways, axis=1).max(axis=1) > BARELY], BEFORE, 1.0)
 
     def _cameras(self, poses: Floats) -> None:
+        """Draw axes at the poses, 4 % of the scene's size long, shorter where there are many."""
         if self._same("/cameras", poses):
             return
         known = poses[np.isfinite(poses).all(axis=(1, 2))]
@@ -164,10 +172,12 @@ class Scene:
         )  # fmt: skip
 
     def _lines(self, name: str, poses: Floats, pairs: Ints, colour: tuple[int, ...], width_px: float) -> None:
+        """Draw pairs (P, 2) of poses as lines, where they or the poses changed."""
         if not self._same(name, poses, pairs):
             self._draw_lines(name, poses[pairs][:, :, :3, 3], colour, width_px)
 
     def _draw_lines(self, name: str, segments: Floats, colour: tuple[int, ...], width_px: float) -> None:
+        """Draw segments (N, 2, 3), those that are not finite left out."""
         segments = segments[np.isfinite(segments).all(axis=(1, 2))]
         if not len(segments):
             self._remove(name)
@@ -177,10 +187,10 @@ class Scene:
         )
 
     def _turn_to(self, pair: Shown | None, home: int) -> None:
-        """Let every page look at the pair; at what it saw before when that is left; at all when `home` grew.
+        """Turn every page to the pair; back to its own view when the pair is left; to the overview when `home` grew.
 
-        A page that comes, or comes back after its connection broke, begins with it: until it has set itself up it
-        may lose what it is told.
+        A page that connects, also again, starts with the same view as `initial_camera`: until it has set itself up it
+        may lose what is sent.
         """
         eye = (-1, -1, home) if pair is None else (pair.i, pair.j, int(pair.wants_points))
         if eye != self._eye:
@@ -201,7 +211,7 @@ class Scene:
             client.camera.position, client.camera.look_at = self._view
 
     def _view_of(self, pair: Shown | None) -> tuple[Floats, Floats]:
-        """Where the pair, or all, is seen from, and its middle."""
+        """The position (3,) that shows the pair, or the overview, and its middle (3,)."""
         if pair is None:
             return self.overview(self._session.settled.world_from_cam)
         back = pair.world_from_i[:3, 3] - pair.middle
@@ -209,7 +219,7 @@ class Scene:
         return pair.middle + 2.2 * pair.size_m * way / max(float(np.linalg.norm(way)), 1e-9), pair.middle
 
     def _same(self, name: str, *drawn: Any) -> bool:
-        """Whether this was drawn with the same numbers before; else they are remembered."""
+        """Whether this name was drawn with the same arrays before; if not, they are remembered."""
         before = self._shown.get(name)
         if before is not None and all(np.array_equal(a, b, equal_nan=True) for a, b in zip(before, drawn, strict=True)):
             return True
@@ -222,7 +232,7 @@ class Scene:
             self._server.scene.remove_by_name(name)
 
     def _clicked(self, event: Any, *, shift: bool) -> None:
-        """Select the edge, or with shift pick the frame, nearest to the click; in a pair pick a point of its clouds."""
+        """Select the edge nearest to the click, or with shift the frame; in a pair side by side pick a point."""
         origin, ray = np.asarray(event.ray_origin, float), np.asarray(event.ray_direction, float)
         session = self._session
         with session.changed:
@@ -242,7 +252,7 @@ class Scene:
                 session.select(int(rows[at]))
 
     def _pick_point(self, pair: Shown, origin: Floats, ray: Floats) -> None:
-        """One point of the first cloud, then one of the second."""
+        """Pick the point nearest to the ray, in the first cloud and in the second by turns."""
         clouds = self._subject.clouds
         assert clouds is not None
         row, pose = (pair.i, pair.world_from_i) if pair.next_is_first else (pair.j, pair.world_from_j)
@@ -253,12 +263,12 @@ class Scene:
 
 
 def thinning(offsets: Ints, most: int) -> int:
-    """Every which point to take so that no more than `most` are left of clouds with these offsets (N + 1,)."""
+    """The stride that leaves at most about `most` points of clouds with these offsets (N + 1,)."""
     return max(1, -(-int(offsets[-1]) // most))
 
 
 def thinned(clouds: CloudSet, row: int, step: int) -> tuple[Floats32, np.ndarray[Any, np.dtype[np.uint8]]]:
-    """Points and colours of a frame, each `step`th; grey where there is no colour."""
+    """Every `step`-th point of a cloud, in its camera's axes, and its colour; grey where there is none."""
     entry = slice(int(clouds.offsets[row]), int(clouds.offsets[row + 1]), step)
     points, colours = np.asarray(clouds.points[entry]), np.asarray(clouds.colours[entry])
     return points, or_grey(colours, len(points))

@@ -1,4 +1,4 @@
-"""A review: decisions about edges, the poses that follow from each, verdicts, and what is being looked at."""
+"""A review: decisions about edges, the poses and verdicts that follow from them, and what is being looked at."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import getpass
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from threading import Condition
 from typing import Any
@@ -17,12 +18,13 @@ from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.edits import ENABLED, REGISTERED, RIGHT, Edit, pair_names, vertex_rows
+from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.review.adding import Candidate, assessed, register_candidate
-from hodge_pipeline.review.decisions import Decisions, LockedError, Said
+from hodge_pipeline.review.decisions import Decisions, LockedError, LogEntry
 from hodge_pipeline.review.jobs import Jobs
 from hodge_pipeline.review.settle import Judged, Settled, Settler, Table, judge
 from hodge_pipeline.review.subject import Subject, open_for_review
-from hodge_pipeline.types import Edges, Floats, Ints
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
 from hodge_pipeline.types.edges import DISABLED
 
 _EDITS: dict[str, Callable[[tuple[str, ...]], Edit]] = {
@@ -33,18 +35,23 @@ _EDITS: dict[str, Callable[[tuple[str, ...]], Edit]] = {
 _SWITCHES = {"disable": DISABLED, "enable": ENABLED, "right": RIGHT}
 VERBS = tuple(_EDITS)
 ALL_VERDICTS = (WRONG, SUSPECT, UNTESTABLE, CONSISTENT)
-"""Shown where nothing is wrong or suspect: an empty page says nothing."""
-MODES = ("all", "edge", "solution", "blink", "between", "apart", "place")
-"""What is shown; the last two are of a candidate alone."""
+"""Shown where no edge is wrong or suspect: an empty page would tell nothing."""
+CANDIDATE_MODES = ("apart", "place")
+MODES = ("all", "edge", "solution", "blink", "between", *CANDIDATE_MODES)
+"""How the scene shows edges; see `Look`."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """What the scene shows: the edge selected (a row, −1: none); everything, or the two clouds of that edge or of the
-    candidate alone, by which motion (`MODES`; between: a `share` of the points as the solution says, the rest as the
-    edge does; apart: side by side, to click points; place: with handles that move the second cloud); a cut through them
-    (at this share of their size above their middle; None: whole); the frames picked to be joined, the verdicts whose
-    edges are drawn; how often all was asked for again.
+    """What the scene shows.
+
+    - `selected`: the row of an edge, −1: none; `picked`: vertex rows to be joined.
+    - `mode`: `all` shows the whole scene, the others the two clouds of the edge or candidate alone. The second cloud
+      lies at the pose of the edge (`edge`), of the solution, of both by turns (`blink`), or with a `share` of its
+      points as the solution has them (`between`). Of a candidate also side by side to click points (`apart`), or with
+      handles that move it (`place`).
+    - `cut`: a cut through the clouds at this share of their size above their middle; None: whole.
+    - `verdicts`: those whose edges are drawn; `home`: how often the overview was asked for again.
     """
 
     selected: int = -1
@@ -57,7 +64,11 @@ class Look:
 
 
 class Session:
-    """The state that every page of a review shows. Its `version` grows with each change that can be seen."""
+    """The state that every page of a review shows; `version` grows with each visible change.
+
+    Two threads work for it: `quick` solves after a decision, `slow` judges, registers and writes. Fields change
+    under the condition `changed`.
+    """
 
     def __init__(self, subject: Subject, *, who: str | None = None, now: Callable[[], str] | None = None) -> None:
         self.changed = Condition()
@@ -72,6 +83,7 @@ class Session:
         self._open(subject)
 
     def _open(self, subject: Subject) -> None:
+        """Begin with a subject: solve with the decisions it has already, register what they add, judge."""
         folder = subject.path if subject.is_run else None
         self.subject = subject
         self.decisions = Decisions(subject.edits, subject.log, run_folder=folder, locked=subject.locked)
@@ -93,19 +105,19 @@ class Session:
         self.slow.close()
 
     def wait(self) -> None:
-        """Return when the poses and the verdicts follow from the latest decision."""
+        """Return when poses and verdicts are those of the latest decision."""
         self.quick.wait()
         self.slow.wait()
         self.quick.wait()
 
     def say(self, message: str) -> None:
-        """A line for every page."""
+        """Show a message on every page."""
         with self.changed:
             self.message = message
             self.bump()
 
     def bump(self) -> None:
-        """Let everything that shows the state look again."""
+        """Wake everything that shows the state."""
         with self.changed:
             self.version += 1
             self.changed.notify_all()
@@ -116,7 +128,7 @@ class Session:
         return pair_names(graph.vertex_ids, graph.edges[np.asarray(rows, np.int64)])
 
     def decide(self, revision: int, verb: str, rows: Sequence[int], note: str = "") -> None:
-        """Disable or enable edges, or hold them for right, and solve. Raises as `Decisions.add`, and `GraphError`."""
+        """Disable edges, enable them or mark them right, and solve. Raises as `Decisions.add`, and `GraphError`."""
         count = len(self.table)
         if verb not in VERBS or not rows or not all(0 <= row < count for row in rows):
             raise GraphError(f"{verb}: expected {', '.join(VERBS)} and rows of edges from 0 to {count - 1}")
@@ -124,10 +136,10 @@ class Session:
         switches = self.decisions.history.switches
         if all(switches.get(pair) == _SWITCHES[verb] for pair in pairs):
             raise GraphError(f"{', '.join(pairs)}: {_SWITCHES[verb]} already")
-        self._change(lambda: self.decisions.add(revision, _EDITS[verb](pairs), self._said(rows, note)))
+        self._change(lambda: self.decisions.add(revision, _EDITS[verb](pairs), self._entry(rows, note)))
 
     def disable_wrong(self, revision: int, note: str = "") -> None:
-        """Disable every edge that counts and is wrong."""
+        """Disable every edge that counts, is wrong and undecided. Raises as `decide`."""
         with self.changed:
             off = self.table.switches(self.decisions.history) != ""
             rows = np.flatnonzero((self.table.edges.verdict == WRONG) & (self.settled.weights > 0) & ~off)
@@ -136,32 +148,33 @@ class Session:
         self.decide(revision, "disable", rows.tolist(), note)
 
     def undo(self, revision: int, note: str = "") -> None:
-        """Take the latest decision back, and solve."""
-        self._change(lambda: self.decisions.undo(revision, self._said((), note)))
+        """Undo the latest decision, and solve. Raises as `Decisions.undo`."""
+        self._change(lambda: self.decisions.undo(revision, self._entry((), note)))
 
     def redo(self, revision: int, note: str = "") -> None:
-        """Let the decision that was taken back last count again, and solve."""
-        self._change(lambda: self.decisions.redo(revision, self._said((), note)))
+        """Redo the decision that was undone last, and solve. Raises as `Decisions.redo`."""
+        self._change(lambda: self.decisions.redo(revision, self._entry((), note)))
 
     def accept(self, revision: int, note: str = "") -> None:
         """Add the edge that was registered. Raises as `decide`."""
-        found = self.candidate
-        if found is None or found.found is None:
+        candidate = self.candidate
+        if candidate is None or candidate.found is None:
             raise GraphError("there is no registered pair to add: pick two frames and register them")
         graph = self.table.graph
-        (pair,) = pair_names(graph.vertex_ids, np.array([[found.i, found.j]]))
-        guess = (pair, tuple(found.found.i_from_j.reshape(-1).tolist()))
-        let_in = (pair,) if found.rejected else ()
+        (pair,) = pair_names(graph.vertex_ids, np.array([[candidate.i, candidate.j]]))
+        guess = (pair, tuple(candidate.found.i_from_j.reshape(-1).tolist()))
+        let_in = (pair,) if candidate.rejected else ()
         edit = Edit(register=(pair,), enable=let_in, guesses=(guess,))
 
         def change() -> None:
-            self.decisions.add(revision, edit, self._said((), note))
-            self._adding.append(found)
+            self.decisions.add(revision, edit, self._entry((), note))
+            self._adding.append(candidate)
             self.candidate = None
 
         self._change(change)
 
     def _change(self, change: Callable[[], None]) -> None:
+        """Make a change of the decisions and solve, also where another program's change refused this one."""
         with self.changed:
             before = self.decisions.revision
             try:
@@ -175,15 +188,15 @@ class Session:
                     self.quick.put("solving", self._solve)
                 self.bump()
 
-    def _said(self, rows: Sequence[int], note: str) -> Said:
-        """Who decides, and what is known of the edges: of several the worst."""
-        said = Said(self._who, self._now(), note[:1000])
+    def _entry(self, rows: Sequence[int], note: str) -> LogEntry:
+        """The log entry of a decision about these edges, with the facts of the one least likely to be right."""
+        entry = LogEntry(self._who, self._now(), note[:1000])
         if not len(rows):
-            return said
+            return entry
         edges, settled = self.table.edges, self.settled
         worst = min(rows, key=lambda row: np.nan_to_num(edges.probability[row], nan=1.0))
         return replace(
-            said,
+            entry,
             verdict=str(edges.verdict[worst]),
             score=_number(float(edges.probability[worst])),
             residual_m=_number(float(settled.residual_m[worst])),
@@ -191,6 +204,7 @@ class Session:
         )
 
     def _solve(self) -> None:
+        """Solve the latest decisions, publish a preview, then what a check from the edges alone makes of it."""
         with self.changed:
             history, revision, settler = self.decisions.history, self.decisions.revision, self._settler
             adding, self._adding = self._adding, []
@@ -204,6 +218,7 @@ class Session:
         self.slow.put("judging", self._judge)
 
     def _publish(self, settler: Settler, settled: Settled) -> None:
+        """Show a result, unless another subject was opened since."""
         with self.changed:
             if settler is self._settler:
                 self.settled = settled
@@ -211,6 +226,7 @@ class Session:
             self.bump()
 
     def _judge(self) -> None:
+        """Diagnose the edges, and show the verdicts unless the table changed since."""
         with self.changed:
             history, table, recipe = self.decisions.history, self.table, self.subject.recipe
         judged = judge(table, history, DiagnosisOptions() if recipe is None else recipe.diagnosis)
@@ -223,7 +239,7 @@ class Session:
             self.bump()
 
     def _register_missing(self) -> None:
-        """Register again what an earlier review added and no solve has had: its motion is known, not how well."""
+        """Register the pairs that an earlier review added and no run has solved: only their motions were stored."""
         recipe, clouds, guesses = self.subject.recipe, self.subject.clouds, self.decisions.history.guesses
         pairs = [pair for pair in self.decisions.history.registered if pair in guesses and not self.rows_of(pair)]
         if recipe is None or clouds is None or not pairs:
@@ -236,7 +252,7 @@ class Session:
         self.quick.put("solving", self._solve)
 
     def show(self, **changes: Any) -> None:
-        """Change what the scene shows; the whole scene, asked for while it is shown, is seen from above again."""
+        """Change fields of `look`; asking for the whole scene while it is shown brings its first view back."""
         with self.changed:
             if changes.get("mode") == self.look.mode == "all":
                 changes["home"] = self.look.home + 1
@@ -245,15 +261,15 @@ class Session:
 
     def select(self, row: int) -> None:
         """Select an edge, −1: none. Raises `GraphError` for a row that is no edge's."""
-        if not -1 <= row < len(self.table):
-            raise GraphError(f"there is no edge {row}: rows go from 0 to {len(self.table) - 1}")
+        if row != -1:
+            self.table.check_row(row)
         with self.changed:
             self.candidate = None
-            self.look = replace(self.look, mode=self.look.mode if self.look.mode in MODES[:5] else "edge")
+            self.look = replace(self.look, mode="edge" if self.look.mode in CANDIDATE_MODES else self.look.mode)
             self.show(selected=row, picked=())
 
     def pick(self, frames: Sequence[int]) -> None:
-        """Pick frames to be joined, by their rows: two of them are the candidate, its guess that of the poses."""
+        """Pick vertex rows to be joined; the last two become the candidate, its guess by the present poses."""
         with self.changed:
             frames = tuple(dict.fromkeys(frames))[-2:]
             self.candidate = None
@@ -263,7 +279,7 @@ class Session:
             self.show(picked=frames, selected=-1)
 
     def click_point(self, point: Floats) -> None:
-        """One more point of the candidate's clouds, in its camera's axes."""
+        """Add a point (3,) of the candidate's next cloud, in its camera's axes."""
         with self.changed:
             if self.candidate is not None:
                 x, y, z = map(float, point)
@@ -274,7 +290,7 @@ class Session:
                 self.bump()
 
     def place(self, world_from_j: Floats) -> None:
-        """The candidate's second cloud was put at this pose (4, 4): its motion is the guess."""
+        """Guess the candidate's motion by the pose (4, 4) that its second cloud was moved to."""
         with self.changed:
             if (now := self.candidate) is not None:
                 i_from_j = se3.inverse(self.settled.world_from_cam[now.i]) @ world_from_j
@@ -282,28 +298,26 @@ class Session:
                 self.bump()
 
     def register(self) -> None:
-        """Register the candidate by the run's own registrar, while the pages go on."""
+        """Register the candidate by the run's own registrar in the background. Raises `GraphError` without a run."""
         subject, wanted = self.subject, self.candidate
-        recipe, clouds = subject.recipe, subject.clouds
         if wanted is None:
             raise GraphError("pick two frames first")
-        if recipe is None or clouds is None:
+        if subject.recipe is None or subject.clouds is None:
             raise GraphError(f"{subject.path}: is no run whose clouds could be registered: add it where it was made")
-        chosen_recipe, chosen_clouds, chosen = recipe, clouds, wanted
-
-        def job() -> None:
-            found = register_candidate(chosen_recipe, chosen_clouds, chosen)
-            with self.changed:
-                if self.candidate is chosen:
-                    poses = self.settled.world_from_cam
-                    self.candidate = assessed(chosen_recipe, self.table.graph, poses, chosen, found)
-                self.bump()
-
-        self.slow.put("registering", job)
+        self.slow.put("registering", partial(self._register, subject.recipe, subject.clouds, wanted))
         self.bump()
 
+    def _register(self, recipe: Recipe, clouds: CloudSet, wanted: Candidate) -> None:
+        """Register a pair, and show the result unless another candidate was chosen since."""
+        found = register_candidate(recipe, clouds, wanted)
+        with self.changed:
+            if self.candidate is wanted:
+                poses = self.settled.world_from_cam
+                self.candidate = assessed(recipe, self.table.graph, poses, wanted, found)
+            self.bump()
+
     def refresh(self) -> None:
-        """Take over what another program has done to the edits, or with the folder."""
+        """Take over edits of another program, and whether one uses the folder."""
         with self.changed:
             self.locked = self.decisions.why_locked()
             if self.decisions.refresh():
@@ -311,7 +325,7 @@ class Session:
             self.bump()
 
     def reopen(self, path: Path) -> None:
-        """Read the subject again, after it was solved elsewhere."""
+        """Open the subject again after it was solved elsewhere, and show the whole scene."""
         subject = open_for_review(path)
         with self.changed:
             self._open(subject)
@@ -323,24 +337,25 @@ class Session:
         return list(self.table.rows.get(pair, ()))
 
     def missing(self) -> list[str]:
-        """The pairs that the decisions want registered and that are no edges yet."""
+        """The pairs `a-b` that decisions register and that are no edges yet."""
         switches = self.decisions.history.switches
         return [pair for pair, switch in switches.items() if switch == REGISTERED and not self.rows_of(pair)]
 
     @property
     def disabled(self) -> int:
-        """How many edges are off by hand."""
+        """How many edges are disabled by hand."""
         return int((self.table.switches(self.decisions.history) == DISABLED).sum())
 
 
 def _with_verdicts(table: Table, edges: Edges) -> Table:
-    """The table with the verdicts of edges that are its first rows."""
+    """The table with the verdicts of these edges, which are its first rows."""
     rows = np.arange(len(edges))
     columns = {name: getattr(edges, name) for name in ("verdict", "probability", "why")}
     return replace(table, edges=table.edges.put(rows, **columns))
 
 
 def _number(value: float) -> str:
+    """A number of four digits for the log; "" where it is unknown."""
     return f"{value:.4g}" if np.isfinite(value) else ""
 
 

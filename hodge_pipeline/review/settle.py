@@ -1,4 +1,4 @@
-"""Poses after each decision: the edges with the weights that the decisions give them, solved from where they are."""
+"""Poses after each decision: the graph with the weights that decisions give its edges, solved from the last poses."""
 
 from __future__ import annotations
 
@@ -24,19 +24,18 @@ from hodge_pipeline.types.arrays import Words
 from hodge_pipeline.types.edges import DISABLED, REJECTED, USED
 
 MOST_CHECKED = 20_000
-"""Edges up to which a solve is checked by one from the edges alone: that takes about 0.05 CPU seconds for each 1000."""
+"""Edges up to which a solve is checked by one from the edges alone, about 0.05 CPU seconds for each 1000."""
 PREVIEW_STEPS = 8
-"""Newton steps after which poses are shown, done or not: a change that leads nowhere new takes 2 to 6."""
+"""Newton steps after which poses are shown, converged or not: a change that stays near the minimum takes 2 to 6."""
 LOWER = 1e-6
-"""Share by which a cost must be lower to count as lower."""
+"""Share by which a cost must be lower to be another minimum's."""
 
 
 @dataclass(frozen=True)
 class Settled:
-    """Poses (V, 4, 4) at a revision of the decisions, what each edge (E,) leaves of them, and what that took.
+    """Poses (V, 4, 4) at a revision of the decisions, with the weights and residuals (E,) of the edges.
 
-    `moved_m` is the farthest that a pose moved by the latest decision, `error_m` the trajectory's error where the truth
-    is known.
+    `moved_m`: the farthest that the latest decision moved a pose; `error_m`: the RMS error where the truth is known.
     """
 
     revision: int
@@ -53,22 +52,24 @@ class Settled:
 
 @dataclass(frozen=True)
 class Judged:
-    """All edges with their verdicts, and the diagnosis of those `rows` of them that could count."""
+    """All edges with their verdicts, and the diagnosis of those `rows` of them that were judged, ascending."""
 
     edges: Edges
     diagnosis: Diagnosis
     rows: Ints
 
     def row(self, edge: int) -> int | None:
-        """The row of an edge in the diagnosis; None where it was not among the judged."""
+        """The row of an edge in the diagnosis; None where it was not judged."""
         at = int(np.searchsorted(self.rows, edge))
         return at if at < len(self.rows) and self.rows[at] == edge else None
 
 
 @dataclass(frozen=True)
 class Table:
-    """All edges with their graph, row by row; the weight (E,) of each without a decision, where enabling gives it one,
-    where it was `added` in this review; and the `rows` of each pair `a-b`, in both directions.
+    """All edges and their graph, row by row.
+
+    `base (E,)`: weights without a decision; `let_in (E,)`: whether enabling gives an edge weight; `added (E,)`: whether
+    it was added in this review; `rows`: those of each pair `a-b`, named in both directions.
     """
 
     edges: Edges
@@ -87,15 +88,20 @@ class Table:
     def __len__(self) -> int:
         return len(self.edges)
 
+    def check_row(self, row: int) -> None:
+        """Raise `GraphError` for a row that is no edge's."""
+        if not 0 <= row < len(self):
+            raise GraphError(f"there is no edge {row}: rows go from 0 to {len(self) - 1}")
+
     def switches(self, history: History) -> Words:
-        """What the decisions say of each edge (E,): disabled, enabled, right, registered or nothing."""
+        """The decision on each edge (E,): disabled, enabled, right, registered or ""."""
         out = np.full(len(self), "", dtype="U16")
         for pair, switch in history.switches.items():
             out[self.rows.get(pair, [])] = switch
         return out
 
     def weights(self, history: History) -> Floats:
-        """The weight (E,) of each edge by the decisions."""
+        """The weights (E,) after the decisions: 0 or 1, or the base where nothing was decided."""
         switches, weights = self.switches(history), self.base.copy()
         weights[switches == DISABLED] = 0.0
         weights[(switches == ENABLED) & self.let_in] = 1.0
@@ -103,7 +109,7 @@ class Table:
         return weights
 
     def with_edge(self, i: int, j: int, found: Registration) -> Table:
-        """The table with a new edge, which counts while the decisions say that it was registered."""
+        """The table with a new edge, which counts while its registration is not undone."""
         row = replace(Edges.of([[i, j]], BY_HAND).with_registrations([found]), status=np.array([USED]))
         edges = Edges.joined([self.edges, row])
         graph = edges.as_graph(self.graph.vertex_ids)
@@ -113,7 +119,7 @@ class Table:
 
 
 def judge(table: Table, history: History, options: DiagnosisOptions) -> Judged:
-    """The verdicts by the edges that could count; those that are off keep the verdict that they had."""
+    """Diagnose the edges that are not off or rejected; the others keep the verdicts that they had."""
     without = table.weights(history) == 0
     off = (table.switches(history) == DISABLED) | (without & (table.added | (table.edges.status == REJECTED)))
     rows = np.flatnonzero(~off)
@@ -124,7 +130,7 @@ def judge(table: Table, history: History, options: DiagnosisOptions) -> Judged:
 
 
 class Settler:
-    """The table of a subject solved at whatever the decisions come to; new edges join it."""
+    """Solves the table of a subject for any history of decisions; edges can be added to it."""
 
     def __init__(self, subject: Subject) -> None:
         self._truth = subject.truth
@@ -142,12 +148,12 @@ class Settler:
         self._editor = _editor(self.table.graph, self._solution)
 
     def solve(self, history: History, revision: int) -> Settled:
-        """The poses that the decisions lead to. Raises `GraphError` where no edge would count."""
+        """The poses after the decisions, of a few Newton steps. Raises `GraphError` where no edge would count."""
         weights, began = self.table.weights(history), time.perf_counter()
         if not (weights > 0).any():
             raise GraphError("no edge would count: enable one first")
         if self._editor is None:
-            self._solution = _plain(self.table.graph, weights, self._solution.world_from_cam)
+            self._solution = _with_weights(self.table.graph, weights, self._solution.world_from_cam)
         else:
             changed = np.flatnonzero(weights != self._editor.weights)
             self._editor.reweight(changed, weights[changed])
@@ -156,8 +162,10 @@ class Settler:
         return self.settled
 
     def checked(self, history: History, revision: int) -> Settled | None:
-        """The poses from the edges alone, where these have a lower cost: the ones at hand, where wrong edges had put
-        them, may lead to a minimum that is none. Else those at hand, solved to the end; None where they are already.
+        """Better poses than the present ones; None where these have converged to the lowest cost found.
+
+        Solving from the edges alone finds a lower minimum where wrong edges had left the poses near another. Without
+        such a minimum the present poses are solved until they converge.
         """
         counted = np.flatnonzero(self.table.weights(history) > 0)
         before, began = self._solution, time.perf_counter()
@@ -181,6 +189,7 @@ class Settler:
         return self.settled
 
     def _settled(self, revision: int, solution: Solution, seconds: float) -> Settled:
+        """The solution with residuals and errors; its movement is from the last poses of the revision before."""
         residual_m, residual_rad = edge_residuals(self.table.graph, solution.world_from_cam)
         if revision != self._before[0]:
             self._before = revision, self.settled.world_from_cam
@@ -199,7 +208,7 @@ class Settler:
 
 
 def moved_m(before: Floats, after: Floats) -> float:
-    """The farthest that a position of the poses (V, 4, 4) lies from where it was, the two sets aligned."""
+    """The farthest that a position moved between two sets of poses (V, 4, 4), the later aligned to the former."""
     known = se3.has_pose(before) & se3.has_pose(after)
     if not known.any():
         return 0.0
@@ -208,21 +217,21 @@ def moved_m(before: Floats, after: Floats) -> float:
 
 
 def error_m(world_from_cam: Floats, truth: Floats) -> float | None:
-    """The RMS error of the positions after alignment; None where fewer than three true poses are known."""
+    """The RMS error of the positions after alignment to the truth (V, 4, 4); None of fewer than three true poses."""
     if se3.has_pose(truth).sum() < 3:
         return None
     return absolute_error(world_from_cam, truth).rmse_m
 
 
 def _editor(graph: ViewGraph, solution: Solution) -> GraphEditor | None:
-    """An editor of the graph; None where the graph has priors, which it does not take."""
+    """An editor that updates the solution; None where the graph has priors, which the editor does not take."""
     if graph.priors is not None and len(graph.priors.vertices):
         return None
     return GraphEditor(graph, solution)
 
 
 def _rows(graph: ViewGraph) -> dict[str, list[int]]:
-    """The rows of the edges of each pair of vertex ids."""
+    """The rows of the edges of each pair of vertex ids `a-b`, in both directions."""
     rows: dict[str, list[int]] = {}
     for pairs in (graph.edges, graph.edges[:, ::-1]):
         for row, name in enumerate(pair_names(graph.vertex_ids, pairs)):
@@ -230,7 +239,8 @@ def _rows(graph: ViewGraph) -> dict[str, list[int]]:
     return rows
 
 
-def _plain(graph: ViewGraph, weights: Floats, start: Floats) -> Solution:
+def _with_weights(graph: ViewGraph, weights: Floats, start: Floats) -> Solution:
+    """The graph with its information times the weights (E,), solved from poses (V, 4, 4) without an editor."""
     counted = np.flatnonzero(weights > 0)
     chosen = graph.select(counted)
     chosen = replace(chosen, information=chosen.information * weights[counted, None, None])

@@ -1,4 +1,4 @@
-"""What is reviewed: the edges of a run, model or pose graph, their poses, and where decisions about them are kept."""
+"""What is reviewed: the edges of a run, COLMAP model or pose graph, their poses, and the files of decisions."""
 
 from __future__ import annotations
 
@@ -28,9 +28,10 @@ from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Solution
 from hodge_pipeline.types.edges import DISABLED, REJECTED, USED
 from hodge_pipeline.types.text import UNKNOWN_UNIT
 
-SIDE_FILE, SIDE_LOG = ".edits.json", ".decisions.csv"
 LOG = "decisions.csv"
-
+"""The log in a folder."""
+SIDE_FILE, SIDE_LOG = ".edits.json", ".decisions.csv"
+"""Endings of the decisions and their log beside a file."""
 UNITS = "the unit of length is the model's own"
 
 
@@ -38,11 +39,12 @@ UNITS = "the unit of length is the model's own"
 class Subject:
     """What is reviewed.
 
-    `edges` are those of the graph and the pairs that were rejected with a motion, row by row `graph`'s; `solution` is
-    that of the graph with a weight for each of them. A run also has a recipe, its scale on every length, clouds and,
-    where its source is still there, frames (its key frames'); a `model` its points as clouds, in its own unit.
-    `truth (V, 4, 4)` is NaN where unknown. Decisions are kept in `edits`, their log in `log`; `locked` says why none
-    can be taken.
+    - `edges`, and row by row `graph`: the edges of the solve and the rejected pairs that have a motion; `solution`: the
+      poses with a weight (E,) for each of them.
+    - `recipe`, `clouds`: of a run, the recipe scaled; `frames`: of its key frames, where the source is still there.
+    - `model`: a COLMAP model, whose `clouds` are the points that each body sees, in the model's own unit.
+    - `truth (V, 4, 4)`: NaN where unknown.
+    - `edits`, `log`: the files of decisions and of their log; `locked`: why none can be taken, "" where they can.
     """
 
     path: Path
@@ -68,34 +70,35 @@ class Subject:
 
     @property
     def is_scanner(self) -> bool:
-        """Whether its poses have x ahead and z up: those of a pose graph whose format tells of no cameras, of scans."""
+        """Whether poses have x ahead and z up: of scans, and of graphs whose format does not say they are cameras'."""
         return not (self.is_run or self.source.of_cameras) if self.clouds is None else is_scanner(self.clouds)
 
     @property
     def finish(self) -> str:
-        """What the last button does."""
+        """What the page's last button says that it does."""
         if self.is_run:
             return "solve and fuse"
         return "save as g2o" if self.model is None else "adjust and save as COLMAP model"
 
     @property
     def unit(self) -> str:
-        """Of its lengths: those of a model without a scale are its own."""
+        """The unit of lengths: a model without a scale has its own."""
         return "m" if self.model is None else UNKNOWN_UNIT
 
     def worded(self, sentence: str) -> str:
-        """A sentence of the diagnosis, which speaks of metres, in the unit of these lengths."""
+        """A sentence of the diagnosis, worded in metres, in the subject's unit."""
         return in_unit(sentence, self.unit == "m")
 
 
 def open_for_review(path: Path) -> Subject:
-    """What a path holds: a run, finished or not, a COLMAP model, a pose graph. Raises `HodgeError` for others."""
+    """The run, finished or not, COLMAP model or pose graph at a path. Raises `HodgeError` for anything else."""
     if is_run_folder(path):
         return _of_run(path)
     return _of_model(path) if [guess.name for guess in guesses(path)[:1]] == ["colmap"] else _of_graph(path)
 
 
 def _of_run(path: Path) -> Subject:
+    """The last round of a run, at its scale; a run that has not ended is locked."""
     run = Run.load(path)
     last, recipe = run.result, run.scaled_recipe
     rows = np.flatnonzero(last.edges.in_graph | _rejected_with_motion(last.edges))
@@ -109,7 +112,7 @@ def _of_run(path: Path) -> Subject:
         name=path.resolve().name,
         edges=edges,
         graph=edges.as_graph(last.vertex_ids),
-        solution=_of_all(last.solution, last.world_from_cam, edges),
+        solution=_with_all_weights(last.solution, last.world_from_cam, edges),
         edits=path / FILE,
         log=path / LOG,
         truth=true_poses(run.source)[run.key_frames.rows],
@@ -123,15 +126,15 @@ def _of_run(path: Path) -> Subject:
 
 
 def _rejected_with_motion(edges: Edges) -> Bools:
-    """Where (E,) a rejected pair could be an edge: its motion is known, and how well."""
+    """Rejected pairs (E,) that could be edges: their motion is finite and their information positive definite."""
     known = np.isfinite(edges.i_from_j).all(axis=(1, 2)) & np.isfinite(edges.information).all(axis=(1, 2))
     rows = np.flatnonzero((edges.status == REJECTED) & known)
     definite = rows[np.linalg.eigvalsh(edges.information[rows]).min(axis=1, initial=np.inf) > 0]
     return np.isin(np.arange(len(edges)), definite)
 
 
-def _of_all(solution: Solution | None, world_from_cam: Floats, edges: Edges) -> Solution:
-    """The solution with a weight for every listed edge, 0 for those that are rejected."""
+def _with_all_weights(solution: Solution | None, world_from_cam: Floats, edges: Edges) -> Solution:
+    """The solution with a weight for every listed edge, 0 of rejected ones; without one the poses as they are."""
     weights = np.zeros(len(edges))
     weights[edges.in_graph] = edges.counts[edges.in_graph] if solution is None else solution.weights
     if solution is None:
@@ -140,6 +143,7 @@ def _of_all(solution: Solution | None, world_from_cam: Floats, edges: Edges) -> 
 
 
 def _of_graph(path: Path) -> Subject:
+    """A pose graph, solved with all its edges."""
     source = read_graph(path)
     assert source.graph is not None
     graph = source.graph
@@ -148,7 +152,7 @@ def _of_graph(path: Path) -> Subject:
 
 
 def _of_model(path: Path) -> Subject:
-    """The largest model of a path, its bodies for vertices, at the poses that its measured edges agree with."""
+    """The largest model at a path as a graph of its bodies, solved by the relative motions that images measure."""
     options = load_model_refinement()
     models, left_out = refinable(options.model.open_models(path))
     model = max(models, key=lambda one: one.quality.images)
@@ -169,7 +173,7 @@ def _of_model(path: Path) -> Subject:
 
 
 def _beside(path: Path, source: Source, edges: Edges, graph: ViewGraph, solution: Solution) -> Subject:
-    """A subject that is no run: decisions are kept beside its file, or in its folder."""
+    """A subject that is no run: its decisions are stored beside its file, or in its folder."""
     is_folder = path.is_dir()
     return Subject(
         path=path,
@@ -186,14 +190,14 @@ def _beside(path: Path, source: Source, edges: Edges, graph: ViewGraph, solution
 
 
 def base_weights(subject: Subject) -> Floats:
-    """The weight (E,) of each edge before any decision: 1, but 0 for those that are rejected or the solver left out.
+    """The weight (E,) of each edge before any decision: 1, but 0 for rejected edges and those the solver left out.
 
-    A solver that weighs edges by how well they fit has found its weights beside the wrong edges: these have driven
-    right ones out, which count in full again here.
+    The solver's own robust weights depend on the wrong edges in its graph, which lower those of right ones: here what
+    counts counts in full. Edges disabled by hand have 1: the decision itself makes it 0.
     """
     return np.where(subject.edges.status == DISABLED, 1.0, (subject.solution.weights > 0).astype(float))
 
 
 def let_in(subject: Subject) -> Bools:
-    """Where (E,) enabling an edge gives it weight: it was rejected or off by hand, not left out by the solver."""
+    """Edges (E,) that enabling gives weight: rejected, used or disabled by hand, but not left out by the solver."""
     return np.asarray(np.isin(subject.edges.status, (REJECTED, DISABLED, USED)))

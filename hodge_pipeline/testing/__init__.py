@@ -1,7 +1,6 @@
-"""Contract checks that every stage can be put through, ours and third parties': `pytest` shows what does not hold.
+"""Contract checks for every kind of stage, ours and third parties': under `pytest` they show what does not hold.
 
-One for each kind of stage; `CHECKS` has them by the kind's name. Each makes the small data that it needs, or takes the
-path of data that is known to be good.
+`CHECKS` has them by the name of the kind. Each makes the small data that it needs, or takes the path of good data.
 """
 
 from collections.abc import Callable, Mapping

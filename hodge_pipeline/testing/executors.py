@@ -27,7 +27,7 @@ def fail(block: int) -> int:
 
 
 def die(folder: Path, own: int, times: int, block: int) -> int:
-    """A task that kills its worker, `times` times, on one block; never the process `own`."""
+    """A task that kills its worker on one block, the first `times` times; never the process `own`."""
     if block == 3 and os.getpid() != own:
         tries = len(list(folder.iterdir()))
         if tries < times:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from dataclasses import replace
 from functools import lru_cache, partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,12 +24,20 @@ SLIDES = 0.02
 """The weakest direction's share of the information on translation, below which acceptance rejects a pair."""
 
 
-def _pair() -> tuple[PointCloud, PointCloud, Floats]:
-    """Clouds i and j, and the true i_from_j."""
+class Pair(NamedTuple):
+    """Cloud i, cloud j and the true i_from_j (4, 4)."""
+
+    target: PointCloud
+    source: PointCloud
+    truth: Floats
+
+
+def _pair() -> Pair:
+    """Two views of the room."""
     scene = room()
     i, j = (scene.frames[row].world_from_cam for row in PAIR)
     assert i is not None and j is not None
-    return scene.clouds[PAIR[0]], scene.clouds[PAIR[1]], se3.inverse(i) @ j
+    return Pair(scene.clouds[PAIR[0]], scene.clouds[PAIR[1]], se3.inverse(i) @ j)
 
 
 def _registered(registrar: Registrar, target: PointCloud, source: PointCloud, guess: Floats) -> Registration:
@@ -109,7 +118,7 @@ def _passes_over_points_that_are_not_finite(registrar: Registrar) -> None:
 
 
 def _says_where_nothing_is_shared(registrar: Registrar) -> None:
-    target, _, _ = _pair()
+    target = _pair().target
     far = seen_from(replace(target, landmarks=nothing().landmarks), se3.exp(np.array([0, 0, 0, 1000.0, 0, 0])))
     few = PointCloud(target.points_in_cam[:3], None, None, nothing().landmarks)
     for what, one, two in (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,14 +16,22 @@ from hodge_pipeline.testing.stage import Contract
 from hodge_pipeline.types import Floats, Priors, Solution, ViewGraph
 
 SIGMA, START_OFF = 1e-3, 0.02
-"""Radians and metres: errors of the edges that solvers are checked with, and of the start."""
+"""Radians and metres: standard deviations of the edges and of the start."""
 EXACT, NO_CHANGE = 1e-3, 1e-5
-"""Radians and metres: what solvers of a few steps leave of the start's errors where edges are exact; and differences a
-hundredth of the edges' errors, as terms of second order make."""
+"""Radians and metres: what a few solver steps may leave of the start's errors where edges are exact; and differences
+that second-order terms make, a hundredth of the edges' errors."""
 
 
-def _ring(noise: float = SIGMA, count: int = 12) -> tuple[ViewGraph, Floats, Floats]:
-    """Poses on a circle of 2 m, each joined to the next three; their true poses, and a start that is a little off."""
+class Ring(NamedTuple):
+    """A graph, its true poses (V, 4, 4), and a start (V, 4, 4) that is a little off."""
+
+    graph: ViewGraph
+    truth: Floats
+    start: Floats
+
+
+def _ring(noise: float = SIGMA, count: int = 12) -> Ring:
+    """Poses on a circle of 2 m, each joined to the next three; the noise is in radians and metres."""
     rng = np.random.default_rng(0)
     angle = 2 * np.pi * np.arange(count) / count
     upright = np.stack([0 * angle, 0 * angle, angle], axis=1)
@@ -32,7 +41,7 @@ def _ring(noise: float = SIGMA, count: int = 12) -> tuple[ViewGraph, Floats, Flo
     measured = exact @ se3.exp(noise * rng.normal(size=(len(edges), 6)))
     information = np.tile(np.eye(6) / SIGMA**2, (len(edges), 1, 1))
     start = truth @ se3.exp(START_OFF * rng.normal(size=(count, 6)))
-    return ViewGraph.from_edges(100 + np.arange(count), edges, measured, information), truth, start
+    return Ring(ViewGraph.from_edges(100 + np.arange(count), edges, measured, information), truth, start)
 
 
 def _without_edges(count: int) -> tuple[ViewGraph, Floats]:
@@ -62,6 +71,7 @@ def _assert_near(poses: Floats, expected: Floats, tolerance: float, what: str) -
 
 
 def _relative(poses: Floats) -> Floats:
+    """The poses in the first one's axes."""
     return np.asarray(se3.inverse(poses[:1]) @ poses)
 
 
@@ -169,18 +179,18 @@ def _does_not_mind_the_unit(solver: ConsistencySolver) -> None:
     _assert_near(poses, _solved(solver, graph, start).world_from_cam, NO_CHANGE, "millimetres give other poses")
 
 
-def _with_copies(wrong_at: int) -> tuple[ViewGraph, Floats, Floats]:
+def _with_copies(wrong_at: int) -> Ring:
     """The ring with three edges between the two vertices of its sixth, one of them wrong."""
     graph, truth, start = _ring()
     tripled = graph.select(np.insert(np.arange(graph.edge_count), 5, [5, 5]))
     motions = tripled.i_from_j.copy()
     motions[5 + wrong_at] = motions[5 + wrong_at] @ se3.exp(np.array([0.5, 0.3, 0, 1.0, 0, -0.5]))
-    return replace(tripled, i_from_j=motions), truth, start
+    return Ring(replace(tripled, i_from_j=motions), truth, start)
 
 
 def _does_not_mind_the_order_of_copies(solver: ConsistencySolver) -> None:
-    (first, _, start), (last, _, _) = _with_copies(0), _with_copies(2)
-    one, two = (_solved(solver, given, start).world_from_cam for given in (first, last))
+    first, last = _with_copies(0), _with_copies(2)
+    one, two = (_solved(solver, given.graph, first.start).world_from_cam for given in (first, last))
     _assert_near(one, two, NO_CHANGE, "a wrong copy of an edge counts otherwise before the right ones than after")
 
 
@@ -195,18 +205,18 @@ def _leaves_out_a_wrong_copy(solver: ConsistencySolver) -> None:
 
 def _solves_components_apart(solver: ConsistencySolver) -> None:
     small, large = _ring(0.0, 5), _ring(0.0, 12)
-    count = small[0].vertex_count
+    count = small.graph.vertex_count
     graph = ViewGraph.from_edges(
         np.arange(count + 12 + 1),
-        np.concatenate([small[0].edges, large[0].edges + count]),
-        np.concatenate([small[0].i_from_j, large[0].i_from_j]),
-        np.concatenate([small[0].information, large[0].information]),
+        np.concatenate([small.graph.edges, large.graph.edges + count]),
+        np.concatenate([small.graph.i_from_j, large.graph.i_from_j]),
+        np.concatenate([small.graph.information, large.graph.information]),
     )
-    start = np.concatenate([small[2], large[2], np.eye(4)[None]])
+    start = np.concatenate([small.start, large.start, np.eye(4)[None]])
     solution = _solved(solver, graph, start)
     parts, poses = (slice(0, count), slice(count, count + 12)), solution.world_from_cam
     assert solution.component.tolist() == [1] * count + [0] * 12 + [2], "components are numbered by their size"
-    for part, truth in zip(parts, (small[1], large[1]), strict=True):
+    for part, truth in zip(parts, (small.truth, large.truth), strict=True):
         _assert_near(_relative(poses[part]), _relative(truth), EXACT, "a component is not solved as it is alone")
         _assert_near(poses[part][0], start[part][0], 1e-9, "the first vertex of a component does not keep its pose")
     _assert_near(poses[-1], start[-1], 1e-9, "a vertex without edges does not keep its pose")

@@ -1,4 +1,4 @@
-"""What the contracts of all kinds of stages share: every stage's own promises, and how properties are checked."""
+"""What the contracts of all kinds of stages share: how properties are checked, and a small room as data."""
 
 from __future__ import annotations
 
@@ -44,8 +44,10 @@ def check_kind(stage: object, protocol: type) -> None:
 
 @dataclass(frozen=True)
 class Contract(Generic[Case]):
-    """The check of one kind of stage: called with a stage, and what else `case` takes, it asserts each of `promises`,
-    and first that the stage has the methods of its `protocol`, pickles, is hashable and cannot be changed.
+    """The check of one kind of stage: called with a stage, and what else `case` takes, it asserts all properties.
+
+    First that the stage has the methods of its `protocol`, pickles, is hashable and cannot be changed; then each of
+    `promises`.
     """
 
     protocol: type
@@ -60,8 +62,9 @@ class Contract(Generic[Case]):
     def __call__(
         self, stage: object, *given: Any, lacks: Collection[str] = (), properties: Collection[str] | None = None
     ) -> None:
-        """Check all properties, or those that are named. One that the stage does not have by its nature is declared in
-        `lacks`, and must then fail. Raises `AssertionError` that says which property does not hold, and why.
+        """Check all properties, or those that are named. Raises `AssertionError`: which does not hold, and why.
+
+        A property that the stage lacks by its nature is declared in `lacks`, and must then fail.
         """
         unknown = {*lacks, *(properties or ())} - {*self.properties}
         assert not unknown, f"no such property: {sorted(unknown)}; there are {list(self.properties)}"
@@ -80,7 +83,7 @@ class Contract(Generic[Case]):
 
 
 def raises(error: type[Exception], call: Callable[[], Any]) -> str | None:
-    """The message of the error that the call raises, None where it raises none; another error is raised."""
+    """The message of the error of this type that the call raises, None where it raises none."""
     try:
         call()
     except error as raised:

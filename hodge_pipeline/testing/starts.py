@@ -122,4 +122,4 @@ check_start = Contract(
         "no points at all": _refuses_a_source_without_points,
     },
 )
-"""Checks a start on twelve frames of a room, which have poses of their own for a start that takes them."""
+"""Checks a start on eight frames of a room, which have poses of their own for a start that takes them."""

@@ -30,7 +30,8 @@ from hodge_pipeline.types.positions import Positions as Positions
 class Camera:
     """A pinhole camera: `u = fx x / z + cx`, `v = fy y / z + cy`, in pixels; `fy` is negative where y points up.
 
-    `readout_s` is how much later its last row is read than its first one, by a rolling shutter; 0: all at once.
+    The centre of the first pixel is (0, 0). `readout_s`: seconds from reading the first row to the last (rolling
+    shutter); 0: all at once.
     """
 
     width: int
@@ -49,10 +50,10 @@ class Camera:
 
 @dataclass(frozen=True)
 class ImageFile:
-    """The colour image that a frame is made from, as its file holds it, the lens's distortion included.
+    """The file of the colour image that a frame is made from, with the distortion of its lens.
 
-    `lens` is a camera model by COLMAP's name (PINHOLE, OPENCV, …) and `params` are its parameters in COLMAP's order, in
-    pixels of which 0, 0 is the outer corner of the image.
+    `lens` is a camera model by COLMAP's name (PINHOLE, OPENCV, …), `params` are its parameters in COLMAP's order, in
+    pixels; (0, 0) is the outer corner of the image.
     """
 
     path: Path
@@ -81,7 +82,7 @@ class Frame:
     - `read_depth()` gives (H, W) float32 metres, 0 where there is no measurement.
     - `read_colour()` gives (H, W, 3) uint8 RGB.
     - `stamp_s` is the moment of the depth image; the colour image was taken `colour_delay_s` later.
-    - `image` is the file behind the colour, which may be another camera's where that is undistorted; None without one.
+    - `image` is the file of the colour image, of another camera model where the frame is undistorted; None without one.
     - `world_from_cam` is the pose that the source gives; None where it has none. The result is compared with it; the
       pipeline never starts from it unless a recipe says so.
     - `true_world_from_cam` is the true pose: of a benchmark, or of what the user names as the truth; else None.
@@ -103,7 +104,7 @@ class Frame:
 
 
 def number_of(frame: Frame) -> int | str:
-    """The number of a frame: its id, or the whole number that is the stamp of a frame with a name; else the name."""
+    """The number of a frame: its id; of a frame with a name its stamp where that is a whole number, else the name."""
     named = isinstance(frame.frame_id, str)
     return int(frame.stamp_s) if named and float(frame.stamp_s).is_integer() else frame.frame_id
 
@@ -127,10 +128,10 @@ class Source:
     - `notes` say what was skipped or repaired, with counts: one line each; `doubts` what may be wrong or missing.
     - `positions` of its frames that are known from elsewhere, such as satellite fixes; None where it has none.
     - `files` identify the input: a run is resumed only while their sizes and times are unchanged.
-    - `contents` say what a recording holds, taken or not, a line each: its topics, its transforms.
-    - `of_cameras`: its format says that poses are cameras', z ahead and y down; a graph of others is a robot's, z up.
+    - `contents` say what a recording holds, used or not, a line each: its topics, its transforms.
+    - `of_cameras`: its format says that poses are cameras', z ahead and y down; else a graph's are robots', z up.
     - `in_metres`: False for a model of images alone, whose lengths are in a unit of its own.
-    - `numbered_hz`: how many of its frames' numbers, which are their stamps, make a second; 0: that is not known.
+    - `numbered_hz`: the frame rate where stamps are frame numbers; 0: unknown.
     """
 
     name: str
@@ -157,10 +158,10 @@ class Source:
 
 @dataclass(frozen=True)
 class Match:
-    """Where cloud j lies in cloud i, found with no guess: `inliers` of the `matches` between them agree with it.
+    """The motion `i_from_j (4, 4)` between two clouds, found without a guess: `inliers` of the `matches` agree with it.
 
-    The identity with no inlier where nothing was found. `rivals` of the other matches agree with another motion; 0
-    where nobody has looked for one. `others` are further motions, to be weighed beside this one by the clouds.
+    The identity with no inlier where nothing was found. `rivals`: how many other matches agree with one other motion; 0
+    also where none was looked for. `others`: further motions, for the clouds to decide between.
     """
 
     i_from_j: Floats
@@ -185,10 +186,10 @@ class Solution:
 
     - `component (V,)`: the connected component of each vertex, 0 the largest.
     - `weights (E,)`: the final weight of each edge relative to its own information, 0 for one that was ignored.
-    - `converged`: whether the least cost was reached, None where a solver does not tell; `stopped_by`: what stopped it
-      before; `certified`: whether the least cost is proven to be the global one, None where that was not tried.
-    - `confirmed`: of a robust solve, whether cycles of the edges that it used close better than by chance. None where
-      it left none out and no cycle tells, as in a tree; and of other solves.
+    - `converged`: whether a minimum was reached, None where the solver does not tell; `stopped_by`: what stopped it
+      before; `certified`: whether the minimum is proven global, None where that was not tried.
+    - `confirmed`: of a robust solve, whether cycles of the edges that it used close better than by chance; None where
+      it left no edge out and has no cycle, as in a tree, and of other solves.
     """
 
     world_from_cam: Floats
@@ -224,11 +225,12 @@ class Model:
 
 @dataclass(frozen=True)
 class ModelQuality:
-    """How well the points of a model fit its images: of N observations, pixels between a point seen and projected.
+    """How well the points of a model fit its images, by N observations.
 
-    `keypoints (N, 2)`: the row in `image_names`, and which of the image's keypoints; `errors_px (N,)`: infinite where
-    the point lies behind the camera; `parallaxes_deg (N,)` between the rays to the point, and in how many images it is
-    seen, `track_lengths (N,)`.
+    - `keypoints (N, 2)`: the row in `image_names`, and the number of the image's keypoint.
+    - `errors_px (N,)`: reprojection errors, infinite where the point lies behind the camera.
+    - `parallaxes_deg (N,)`: the angle between the rays to the point; `track_lengths (N,)`: images that see it.
+    - `point_rows (N,)`: the row of the point, below `points`.
     """
 
     images: int
@@ -239,11 +241,12 @@ class ModelQuality:
     errors_px: Floats
     parallaxes_deg: Floats
     track_lengths: Ints
+    point_rows: Ints
 
 
 @dataclass(frozen=True)
 class PositionPriors:
-    """Where each body of a model should be: `positions (B, 3)` and their `covariances (B, 3, 3)`; NaN: none."""
+    """Priors on where the bodies of a model are: `positions (B, 3)`, `covariances (B, 3, 3)`, NaN without a prior."""
 
     positions: Floats
     covariances: Floats

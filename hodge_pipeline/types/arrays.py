@@ -1,4 +1,4 @@
-"""Names of the arrays that flow, and some of their rows."""
+"""Names for the types of arrays, rows chosen from them, and their root mean square."""
 
 from typing import TypeAlias
 
@@ -17,6 +17,11 @@ def evenly(available: int, most: int) -> Ints:
     """At most so many rows (N,) of `available`, spread evenly, the first and the last among them."""
     kept = max(min(most, available), 0)
     return np.unique(np.linspace(0, available - 1, kept).round().astype(np.int64)) if kept else np.zeros(0, np.int64)
+
+
+def rms(values: Floats) -> float:
+    """The root mean square of all values; NaN of none."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
 
 
 def groups(labels: Ints) -> list[tuple[int, Ints]]:

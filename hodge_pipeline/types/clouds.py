@@ -1,4 +1,4 @@
-"""What one frame shows as points, and the clouds of all frames as columns of files."""
+"""The point cloud of a frame, and those of all frames as memory-mapped columns."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 from hodge_pipeline.types.arrays import Bytes, Floats32, Ints
 
 CLOUDS_AT_ONCE = 64
-"""Read before their memory is given back: 4 to 15 MB."""
+"""Clouds read before their memory is given back: 4 to 15 MB."""
 
 
 @dataclass(frozen=True)
 class Landmarks:
-    """What a frame's image can be recognised by: `points_in_cam (n, 3)` metres, SIFT `descriptors (n, 128)` bytes, and
-    `pixel_rad (n,)`, the angle that a pixel of the image covers, by which each may be off sideways.
+    """SIFT features of a frame's image with depth, by which the place is recognised.
+
+    `points_in_cam (n, 3)` metres, `descriptors (n, 128)` bytes, `pixel_rad (n,)`: the angle of a pixel, by which each
+    point may be off sideways.
     """
 
     points_in_cam: Floats32
@@ -42,10 +44,10 @@ class Landmarks:
 class PointCloud:
     """Points of one frame, in its camera's axes: `points_in_cam (N, 3)` metres, unit normals, 8-bit RGB.
 
-    `landmarks` are other points, of the frame's image; None where nobody asked for them. `times_s (N,)` is when each
-    point was measured, seconds after the first, by a scanner that turns while it moves; None where nobody says.
-    `first_s` is the moment of the first as the sensor counts it: by a clock, or after the frame's stamp.
-    `no_numbers` is how many more points the reader left out, whose coordinates are no numbers.
+    - `landmarks`: features of the frame's image, None where they were not asked for.
+    - `times_s (N,)`: when a scanner measured each point, seconds after the first; None where unknown.
+    - `first_s`: the time of the first point as the sensor counts it, by a clock or after the frame's stamp.
+    - `no_numbers`: how many points the reader left out, since their coordinates are no numbers.
     """
 
     points_in_cam: Floats32
@@ -139,7 +141,7 @@ class CloudSet(Sequence[PointCloud]):
         return f"CloudSet({len(self)} clouds, {int(self.offsets[-1])} points)"
 
     def __getitem__(self, row: int) -> PointCloud:  # type: ignore[override]
-        """The cloud of one frame (a view, not a copy); the memory of those read before is given back now and then."""
+        """The cloud of one frame, a view; every `CLOUDS_AT_ONCE` reads the memory is given back."""
         if not -len(self) <= row < len(self):
             raise IndexError(row)
         self._reads += 1
@@ -169,15 +171,15 @@ class CloudSet(Sequence[PointCloud]):
 
     @property
     def reach_m(self) -> float:
-        """How far the farthest point of any cloud is from its camera; 1 where there is none."""
+        """Metres from a camera to the farthest point of its cloud, over all clouds; 1 where there is no point."""
         return max((float(np.linalg.norm(c.points_in_cam, axis=1).max()) for c in self if len(c)), default=0.0) or 1.0
 
 
 class _Column:
-    """An array in a `.npy` file that begins with `first` and grows: a context that ends with its header."""
+    """A context that writes an array to a `.npy` file in parts, the first being `first`, and its header at the end."""
 
     def __init__(self, path: Path, first: NDArray[Any]) -> None:
-        path.unlink(missing_ok=True)  # it may be another name of a file that is kept
+        path.unlink(missing_ok=True)  # a hard link to a file that is kept must not be written to
         self._file, self._first, self.rows = path.open("wb"), first, 0
 
     def __enter__(self) -> _Column:
@@ -193,12 +195,12 @@ class _Column:
                 self._write_header()
 
     def append(self, rows: NDArray[Any]) -> None:
-        # Not numpy's own writing to files: on a disk that fills up its last bytes are lost without an error.
+        """Write more rows; not by `tofile`, which loses the last bytes on a full disk without an error."""
         self._file.write(np.ascontiguousarray(rows, self._first.dtype).data)
         self.rows += len(rows)
 
     def _write_header(self) -> None:
-        """As long for any number of rows: numpy leaves room for it to grow."""
+        """Write the header over the last one: it has the same length for any number of rows."""
         shape = (self.rows, *self._first.shape[1:])
         self._file.seek(0)
         np.lib.format.write_array_header_1_0(
@@ -207,4 +209,5 @@ class _Column:
 
 
 def _offsets(sizes: Sequence[int]) -> Ints:
+    """Where (N + 1,) parts of these sizes begin, and the last ends."""
     return np.concatenate([[0], np.cumsum(np.array(sizes, np.int64))]).astype(np.int64)

@@ -1,4 +1,4 @@
-"""The edges of a run as one table that grows by columns, and the viewing graph that solvers get of it."""
+"""The edges of a run as one table that grows by columns, and the viewing graph that solvers take."""
 
 from __future__ import annotations
 
@@ -14,15 +14,17 @@ from hodge_pipeline.types.arrays import Bools, Floats, Ints, Words
 
 CANDIDATE, HELD_OUT, REJECTED = "candidate", "held_out", "rejected"
 USED, IGNORED, DISABLED = "used", "ignored", "disabled"
-"""The `status` of a row of `Edges`: proposed; kept out to judge by; registered, but no edge; an edge that counts; one
-to which the solver gave no weight; one that a person switched off.
+"""The `status` of a row of `Edges`: proposed; held out to judge by; rejected by acceptance; an edge that counts; one to
+which the solver gave no weight; one that a person disabled.
 """
 
 
 @dataclass(frozen=True)
 class Priors:
-    """Poses known from elsewhere: vertex rows (P,), `world_from_vertex (P, 4, 4)`, and `information (P, 6, 6)` of ξ =
-    (rotation, translation) in `world_from_vertex · exp(ξ)`; several of one vertex count each.
+    """Unary pose priors: `vertices (P,)` rows, `world_from_vertex (P, 4, 4)`, `information (P, 6, 6)`.
+
+    The information is of ξ = (rotation, translation) in `world_from_vertex · exp(ξ)`, radians and metres; a vertex may
+    have several.
     """
 
     vertices: Ints
@@ -32,10 +34,10 @@ class Priors:
 
 @dataclass(frozen=True)
 class Registration:
-    """What a registrar found for one pair; see `ViewGraph` for the meaning and units of each field.
+    """The registration of one pair; see `ViewGraph` for the meaning and units of each field.
 
-    `iterations` are its steps from the guess: where it `converged` in none, its answer does not depend on the guess,
-    and the pair is not registered again from other poses.
+    `iterations` counts the steps from the guess. A registrar that `converged` in none did not use the guess, so the
+    pair is not registered again from other poses.
     """
 
     i_from_j: Floats
@@ -62,7 +64,7 @@ class ViewGraph:
     - `correspondences (E,)`: how many; 0 where unknown.
     - `dimension`: 2 for a graph in the plane z = 0, lifted, with no information out of it; it stays one when written.
     - `fixed`: rows of the vertices that the source holds at the poses it gives them.
-    - `priors`: what the source says of single poses, None where it says nothing.
+    - `priors`: unary pose priors, None without any.
     """
 
     vertex_ids: NDArray[np.generic]
@@ -102,7 +104,7 @@ class ViewGraph:
         dimension: int = 3,
         fixed: Ints | None = None,
     ) -> ViewGraph:
-        """A graph of measured edges; the information defaults to the identity, what was not seen to NaN or 0.
+        """A graph of measured edges; the information defaults to the identity, unknown columns are NaN or 0.
 
         Raises `GraphError` where there is not one motion (4, 4) and one information (6, 6) for each edge.
         """
@@ -132,7 +134,7 @@ class ViewGraph:
 
     @classmethod
     def joined(cls, graphs: Sequence[ViewGraph]) -> ViewGraph:
-        """One graph with the edges of all, one graph's after the other's, over the vertices of the first."""
+        """One graph with the edges of all graphs in order, over the vertices of the first."""
         names = ("edges", "source", *MEASURED)
         columns: dict[str, Any] = {name: np.concatenate([getattr(graph, name) for graph in graphs]) for name in names}
         return replace(graphs[0], **columns)
@@ -147,10 +149,10 @@ class Edges:
       `overlap (E,)`: the score of the proposal in [0, 1].
     - Registered: `i_from_j`, `information`, `fitness`, `rmse_m`, `correspondences` as in `ViewGraph`, `iterations`, and
       whether it `converged`.
-    - Accepted: `status (E,)`, one of the six above; `why (E,)`: the reason of a rejection, later that of the verdict.
+    - Accepted: `status (E,)`, one of the six words; `why (E,)`: the reason of a rejection, later of the verdict.
     - Solved: `weight (E,)` relative to its own information, `residual_m`, `residual_rad (E,)` under the poses.
     - Judged: `verdict (E,)`; `probability (E,)` that it is right, NaN where untestable; `leverage (E,)`: its share in
-      where its ends lie.
+      fixing the poses of its ends.
     """
 
     pairs: Ints
@@ -182,11 +184,11 @@ class Edges:
 
     @classmethod
     def of(cls, pairs: Ints | Sequence[Sequence[int]], proposed_by: str | Words = "") -> Edges:
-        """Candidates (P, 2) as they are, of which nothing else is known."""
+        """Candidate pairs (P, 2) as they are; everything else is unknown."""
         pairs = np.asarray(pairs, np.int64).reshape(-1, 2)
         count = len(pairs)
         number, word, whole = np.full(count, np.nan), np.full(count, ""), np.zeros(count, np.int64)
-        nothing = np.array(np.nan)  # seen in every element, which takes no memory
+        nothing = np.array(np.nan)  # broadcast to every element, which takes no memory
         return cls(
             pairs=pairs,
             proposed_by=np.full(count, proposed_by),
@@ -210,7 +212,7 @@ class Edges:
 
     @classmethod
     def proposed(cls, pairs: Ints, proposed_by: str, overlap: Floats | None = None) -> Edges:
-        """What an edge builder gives: distinct pairs (P, 2) for one reason, each turned to i < j, all sorted."""
+        """The table of an edge builder: distinct pairs (P, 2) of one reason, each turned to i < j, all sorted."""
         pairs = np.sort(np.asarray(pairs, np.int64).reshape(-1, 2), axis=1)
         order = np.lexsort((pairs[:, 1], pairs[:, 0]))
         table = cls.of(pairs[order], proposed_by)
@@ -218,12 +220,12 @@ class Edges:
 
     @classmethod
     def measured(cls, graph: ViewGraph) -> Edges:
-        """The edges of a graph, which count."""
+        """The edges of a graph, all of which count."""
         columns = {name: getattr(graph, name) for name in MEASURED}
         return replace(cls.of(graph.edges, graph.source), status=np.full(graph.edge_count, USED), **columns)
 
     def with_registrations(self, found: Sequence[Registration]) -> Edges:
-        """The table with a registration for each row; all count until acceptance rejects some."""
+        """The table with a registration of each row; all count until acceptance rejects some."""
 
         def column(name: str, shape: tuple[int, ...], kind: type) -> NDArray[Any]:
             return np.array([getattr(one, name) for one in found], kind).reshape(-1, *shape)
@@ -266,7 +268,7 @@ class Edges:
 
     @property
     def in_graph(self) -> Bools:
-        """The rows (E,) that are edges, those that are off by hand included."""
+        """The rows (E,) that are edges, those disabled by hand included."""
         return np.isin(self.status, (USED, IGNORED, DISABLED))
 
     @property
@@ -276,7 +278,7 @@ class Edges:
         return dict(zip(reasons.tolist(), counts.tolist(), strict=True))
 
     def as_graph(self, vertex_ids: ArrayLike, rows: Ints | Bools | slice = slice(None)) -> ViewGraph:
-        """The viewing graph of these rows, each of which has a motion."""
+        """The viewing graph of these rows, each of which must have a motion."""
         columns = {name: getattr(self, name)[rows] for name in MEASURED}
         pairs, source = self.pairs[rows], self.proposed_by[rows]
         return ViewGraph(vertex_ids=np.asarray(vertex_ids), edges=pairs, source=source, **columns)

@@ -1,4 +1,4 @@
-"""The one way to open an input file, which is not trusted: a regular one, opened without waiting, read to a limit."""
+"""Open input files, which are not trusted: regular ones only, without blocking, and no longer than a limit."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 MAX_WHOLE_BYTES = 1 << 31
-"""What is read whole is no longer: 2 GiB of text are 20 million edges, or a model of 10,000 images with its tracks."""
+"""The longest file that is read whole: 2 GiB of text are 20 million edges, or a model of 10,000 images."""
 _LFS_HEAD, _LFS_BYTES = b"version https://git-lfs", 1024
-"""What stands in a working tree in the place of a file that Git LFS keeps elsewhere; pointers are shorter."""
+"""How a pointer of Git LFS, in the place of the file itself, begins, and a length that it stays below."""
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _KINDS = {
     stat.S_IFDIR: (errno.EISDIR, "a folder"),
@@ -24,9 +24,9 @@ _KINDS = {
 
 
 def open_input(path: Path) -> BinaryIO:
-    """The file, for reading bytes. Raises `OSError` for what is missing and at once for what is no regular file.
+    """The file, open for reading bytes. Raises `OSError` for one that is missing, a pointer of Git LFS or not regular.
 
-    A pipe would wait for a writer, a device never end: both are looked at before they are opened, and after.
+    A pipe would wait for a writer and a device never end, so the kind of file is checked before opening, and after.
     """
     try:
         _check_regular(path, os.stat(path).st_mode)
@@ -66,7 +66,7 @@ def read_input_text(path: Path, limit: int = MAX_WHOLE_BYTES, *, errors: str = "
 
 
 def beginning(path: Path, size: int) -> bytes:
-    """The first bytes of the file, by which a reader knows its format; none where it cannot be read."""
+    """The first bytes of a file, by which readers recognise formats; none where it cannot be read."""
     try:
         with open_input(path) as file:
             return file.read(size)

@@ -1,4 +1,4 @@
-"""Facts that a run reports: they travel as values, and become sentences where a person reads them."""
+"""Notes: facts that a run reports, which travel as values and become sentences where a person reads them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ from hodge_pipeline.types.text import suiting
 
 
 class Rank(IntEnum):
-    """How much a reader should heed a note: the input may be wrong, and so what follows from it; the result is in
-    doubt; it needs a look; or it only informs.
-    """
+    """How grave a note is: the input may be wrong; the result is in doubt; something needs a look; it only informs."""
 
     INPUT = 0
     DOUBT = 1
@@ -177,9 +175,7 @@ class _Count(int):
 
 @dataclass(frozen=True)
 class Note:
-    """A fact of a run: its kind (see `WORDING`), how many it concerns, and what in particular; `str` gives the
-    sentence.
-    """
+    """A fact of a run: its kind (see `WORDING`), how many things it concerns and a detail; `str` gives the sentence."""
 
     kind: str
     count: int = 1
@@ -194,10 +190,10 @@ class Note:
 
     @property
     def rank(self) -> Rank:
-        """How much a reader should heed it."""
+        """How grave it is."""
         return WORDING[self.kind][0]
 
 
 def notes_of(kind: str, details: Iterable[str]) -> tuple[Note, ...]:
-    """A note of one kind for each of these details, which are sentences of a stage."""
+    """A note of one kind for each detail, a sentence of a stage."""
     return tuple(Note(kind, detail=detail) for detail in details)

@@ -1,4 +1,4 @@
-"""The one way to write an output file: a reader sees the old one or all of the new one."""
+"""Write output files atomically: a reader sees the old file or all of the new one."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import IO
 
 
 def draft_of(path: Path) -> Path:
-    """What a file is called while this process writes it; a killed one leaves it there."""
+    """The name of a file while this process writes it; a killed process leaves it behind."""
     return path.with_name(f".{path.name}.{os.getpid()}.draft")
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """A file to be written, which takes its name, all of it on the disk, once the body ends well. Raises `OSError`."""
+    """A file to write, which replaces `path` once the body ends well and all is on the disk. Raises `OSError`."""
     draft = draft_of(path)
     try:
         with open(draft, "wb") as file:

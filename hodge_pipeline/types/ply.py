@@ -1,6 +1,6 @@
-"""PLY files: their header, binary vertices read in parts and no further than the file is long, models written and read.
+"""PLY files: headers, binary vertices in parts, and models. Sizes that a header states are checked against the file.
 
-The one codec of the project: fused models, and points of any other program (see `hodge_adapters.clouds.ply`).
+It serves fused models, and points of other programs (see `hodge_adapters.clouds.ply`).
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from hodge_pipeline.types.input_files import open_input
 
 MAX_HEADER_BYTES = 1 << 16
 ROWS_IN_PART = 1 << 20
+"""Vertices that are read at once."""
 TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -38,9 +39,11 @@ FACE_PROPERTY = "list uchar int vertex_indices"
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """Where the vertices lie: `count` records of `properties` (name, type) after `start` bytes and `lines` lines; how
-    many `triangles` of ours follow, None where there is another element or none; the comments; whether no element
-    follows.
+    """The header of a PLY file with vertices.
+
+    - `order`: the byte order of numpy, "" of text; `count` vertices of `properties` (name, numpy type).
+    - `start`, `lines`: the bytes, in a text file the lines, before the first vertex.
+    - `triangles`: how many follow in the form that we write, None without them; `is_last`: no element follows.
     """
 
     order: str
@@ -60,6 +63,8 @@ class PlyHeader:
 
 @dataclass
 class _Element:
+    """An element of a header; `declared` holds its list properties as written."""
+
     name: str
     count: int
     properties: list[tuple[str, str]]
@@ -67,7 +72,7 @@ class _Element:
 
 
 def read_header(path: Path, file: BinaryIO) -> PlyHeader:
-    """The header at the beginning of a file. Raises `SourceError` for one that is damaged or has no plain vertices."""
+    """The header at the beginning of a file. Raises `SourceError` for a damaged one, or vertices that are no points."""
     contents = file.read(MAX_HEADER_BYTES)
     end = contents.find(b"end_header")
     after = contents.find(b"\n", end)
@@ -99,6 +104,7 @@ def read_header(path: Path, file: BinaryIO) -> PlyHeader:
 
 
 def _vertices(path: Path, order: str, elements: list[_Element], start: int, comments: tuple[str, ...]) -> PlyHeader:
+    """The header by its elements, with what lies before the vertices skipped."""
     lines = 0
     for row, element in enumerate(elements):
         if element.name == "vertex":
@@ -118,15 +124,15 @@ def _vertices(path: Path, order: str, elements: list[_Element], start: int, comm
 
 
 def vertex_parts(path: Path, file: BinaryIO, header: PlyHeader) -> Iterator[NDArray[np.void]]:
-    """The records of a binary file's vertices, in parts, at least one. `SourceError` where they are not there."""
-    _check_room(path, file, header.start, header.count * header.dtype.itemsize, header.count, "points")
+    """The vertices of a binary file in parts, at least one. Raises `SourceError` where the file is too short."""
+    _check_length(path, file, header.start, header.count * header.dtype.itemsize, header.count, "points")
     file.seek(header.start)
     for start in range(0, max(header.count, 1), ROWS_IN_PART):
         yield np.fromfile(file, header.dtype, min(ROWS_IN_PART, header.count - start))
 
 
 def read_model(path: Path) -> Model:
-    """The model that `model_parts` are of, in a binary file. Raises `SourceError` for what is none."""
+    """The model in a file that `model_parts` made. Raises `SourceError` for any other."""
     try:
         with open_input(path) as file:
             header = read_header(path, file)
@@ -135,7 +141,7 @@ def read_model(path: Path) -> Model:
             vertices = np.concatenate(list(vertex_parts(path, file, header)))
             faces = None
             if header.triangles is not None:
-                _check_room(path, file, file.tell(), header.triangles * FACE.itemsize, header.triangles, "triangles")
+                _check_length(path, file, file.tell(), header.triangles * FACE.itemsize, header.triangles, "triangles")
                 faces = np.fromfile(file, FACE, header.triangles)
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions") from error
@@ -152,7 +158,7 @@ def read_model(path: Path) -> Model:
 
 
 def model_parts(model: Model) -> tuple[Any, ...]:
-    """The bytes of a binary, little-endian file, in parts; the model's name and notes are comments of its header."""
+    """The bytes of a binary, little-endian file in parts; the header's comments hold the model's name and notes."""
     vertices = _records(model)
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += [f"comment name {_one_line(model.name)}"] if model.name else []
@@ -185,7 +191,7 @@ def _one_line(text: str) -> str:
     return " ".join(text.split())
 
 
-def _check_room(path: Path, file: BinaryIO, start: int, size: int, count: int, what: str) -> None:
+def _check_length(path: Path, file: BinaryIO, start: int, size: int, count: int, what: str) -> None:
     room = os.fstat(file.fileno()).st_size - start
     if size > room:
         raise SourceError(f"{path}: says {count} {what}, has {max(room, 0)} bytes for them: copy it again")

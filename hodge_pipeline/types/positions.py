@@ -11,15 +11,15 @@ from hodge_pipeline.types.arrays import Bools, Floats, Words
 SEMI_MAJOR_M, FLATTENING = 6378137.0, 1 / 298.257223563
 """Of the ellipsoid WGS 84."""
 FAR_M, WHOLE_M = 1e4, 1e3
-"""Coordinates farther out, as a map has, lose digits in clouds of 32-bit numbers: whole kilometres are taken off."""
+"""Metres from zero beyond which 32-bit clouds lose digits, as in map coordinates, and the unit that is subtracted."""
 
 
 @dataclass(frozen=True)
 class Positions:
     """Known positions in a world of metres, z up: `points (P, 3)`, `covariances (P, 3, 3)`, NaN where none is stated.
 
-    Each belongs to the frame that `names (P,)` name, or is of the moment `stamps_s (P,)`; the other is empty, or NaN.
-    `origin` says where the world's zero is.
+    Each belongs to the frame of a name in `names (P,)`, or to the time in `stamps_s (P,)`; the other is "" or NaN.
+    `origin` says where the zero of the world is.
     """
 
     points: Floats
@@ -33,11 +33,11 @@ class Positions:
 
     @property
     def labels(self) -> Words:
-        """What each is called in a message: its frame's name, else its stamp."""
+        """What messages call each (P,): its frame's name, else its stamp."""
         return np.where(self.names != "", self.names, [f"{stamp:.3f} s" for stamp in self.stamps_s])
 
     def near_zero(self) -> Positions:
-        """The same with whole kilometres taken off where they lie far from zero, which `origin` then says."""
+        """The positions with whole kilometres subtracted where they lie far from zero, as `origin` then says."""
         off = whole_kilometres(self.points)
         if not off.any():
             return self
@@ -46,14 +46,15 @@ class Positions:
 
 
 def whole_kilometres(points: Floats) -> Floats:
-    """The whole kilometres (3,), in metres, nearest to the middle of points (P, 3) far from zero; else zeros."""
+    """Whole kilometres (3,), in metres, nearest to the median of points (P, 3) far from zero; zeros of others."""
     middle = np.median(points, axis=0) if len(points) else np.zeros(3)
     return np.asarray(WHOLE_M * np.round(middle / WHOLE_M) * bool(np.abs(middle).max() > FAR_M))
 
 
 def from_geodetic(geodetic: Floats, covariances: Floats, names: Words, stamps_s: Floats) -> Positions:
-    """Positions from latitude, longitude (degrees) and height (metres) above WGS 84 (P, 3): east, north, up of the
-    plane that touches the ellipsoid below the first; covariances (P, 3, 3) are already of east, north, up.
+    """East, north, up from latitude, longitude (degrees) and height (metres) above WGS 84, (P, 3).
+
+    The zero is the first position; covariances (P, 3, 3) are of east, north, up already.
     """
     first = geodetic[0]
     lat, lon = np.radians(first[:2])
@@ -82,9 +83,10 @@ def earth_centred(geodetic: Floats) -> Floats:
 class PositionFit:
     """How known positions (P,) fit the poses that were solved with them.
 
-    `used (P,)`; `residuals (P, 3)`: known less found, metres; `distance (P,)`: from what all others say, in sigmas;
-    NaN where nothing places the frame. `edge_factor`, `fix_factor`: what the sigma that edges and positions state
-    was multiplied by, to fit how they scatter. `origin` as in `Positions`; `problems`: what was not placed, and why.
+    - `used (P,)`; `residuals (P, 3)`: known less found, metres, NaN where nothing places the frame.
+    - `distance (P,)`: in sigmas, from where all the others put it; NaN likewise.
+    - `edge_factor`, `fix_factor`: by what the stated sigmas of edges and positions were multiplied to fit.
+    - `origin` as in `Positions`; `problems`: what was not placed, and why.
     """
 
     labels: Words

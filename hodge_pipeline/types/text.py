@@ -1,4 +1,4 @@
-"""Text that may hold what a stranger wrote: shown without effect on a terminal, a log, a shell or a spreadsheet."""
+"""Text of unknown origin made safe for terminals, logs, shells and spreadsheets; counts, tables and file names."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _NO_STEM = re.compile(r"[^\w.+-]+")
 _NUMBER = re.compile(r"[4-8][0-9]{18}(?<![\d.][0-9]{19})(?!\d)")  # looks back last: a page has a million characters
 _SYMBOL = re.compile(r"[A-Za-z](0|[1-9]\d{0,8})")
 SYMBOLS = 1 << 56
-"""Of one letter."""
+"""Symbols of one letter."""
 UNKNOWN_UNIT = "units"
-"""Of lengths where nothing tells the scale."""
+"""The unit of lengths where nothing tells the scale."""
 MAX_STEM = 100
 """Characters: with a beginning and an ending they stay below the 255 bytes that file systems allow."""
 
 
 def visible(text: object, *, lines: bool = False) -> str:
-    r"""The text on one line, each character that moves a cursor, colours, hides or turns round shown as `\x1b`.
+    r"""The text on one line, with each control, hiding or direction character as an escape such as `\x1b`.
 
     With `lines` line ends and tabs stay.
     """
@@ -31,8 +31,9 @@ def visible(text: object, *, lines: bool = False) -> str:
 
 
 def with_symbols(text: str) -> str:
-    """The text with each number that is one of gtsam's Symbols, a letter in the upper 8 of 64 bits and an index in the
-    others, as gtsam prints it: `a12`.
+    """The text with each number that is one of gtsam's Symbols written as gtsam prints it: `a12`.
+
+    A Symbol has a letter in the upper 8 of 64 bits and an index in the others.
     """
     return _NUMBER.sub(_symbol, text)
 
@@ -64,24 +65,24 @@ def command(*words: object) -> str:
 
 
 def cell(text: str) -> str:
-    """The text as a cell of a table that a spreadsheet opens: one that it would compute begins with `'`."""
+    """The text as a cell of a spreadsheet: one that it would take for a formula gets a leading `'`."""
     return f"'{text}" if _FORMULA.match(text) else text
 
 
 def cell_text(text: str) -> str:
-    """What `cell` was given."""
+    """The text that `cell` was given."""
     return text[1:] if _FORMULA.match(text[1:2]) and text.startswith("'") else text
 
 
 def csv_text(rows: Iterable[Iterable[object]], *, quoted: bool = False) -> str:
-    """The rows as CSV; `quoted`: every cell. Words that strangers wrote are given by `cell`."""
+    """The rows as CSV; `quoted`: every cell is. Words of unknown origin must come from `cell`."""
     text = io.StringIO(newline="")
     csv.writer(text, lineterminator="\n", quoting=csv.QUOTE_ALL if quoted else csv.QUOTE_MINIMAL).writerows(rows)
     return text.getvalue()
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Iterable[object]], names: int | None = None) -> str:
-    """The rows under a header as Markdown; the first `names` columns (None: all) are words, the rest numbers."""
+    """The rows as a Markdown table; the first `names` columns (None: all) hold words, the others numbers."""
     words = len(header) if names is None else names
     align = ["---" if column < words else "---:" for column in range(len(header))]
     cells = ([str(cell).replace("|", "\\|") for cell in row] for row in (header, align, *rows))
@@ -89,7 +90,7 @@ def markdown_table(header: Sequence[str], rows: Iterable[Iterable[object]], name
 
 
 def file_stems(names: list[str]) -> list[str]:
-    """A name without folders for each of these, all different, however they are written."""
+    """A file name without folders for each name, all different even where case does not count."""
     stems: list[str] = []
     for name in names:
         stem = wanted = _NO_STEM.sub("_", name)[:MAX_STEM]

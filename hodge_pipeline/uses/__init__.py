@@ -1,1 +1,1 @@
-"""The uses of the package beside a run: trajectories and models refined, graphs diagnosed, runs recorded again."""
+"""What the package is used for: run a recipe, refine, register, diagnose, compare, record again."""

@@ -1,4 +1,4 @@
-"""Refine a COLMAP model from Python or the command line: options in, models and a run folder out."""
+"""Refine COLMAP models from Python or the command line: options in, models and a run folder out."""
 
 from __future__ import annotations
 
@@ -20,17 +20,14 @@ from hodge_pipeline.uses.model_folder import model_workspace, write_run_folder
 
 @dataclass(frozen=True)
 class RefinedColmap:
-    """What became of each model, and the folder that it was written to, if to any.
-
-    `models` are pycolmap's: the refined ones, or the inputs as they came where the guard kept those.
-    """
+    """The result of each model, the largest first, and the run folder, None where nothing was written."""
 
     results: tuple[RefinedModel, ...]
     folder: Path | None
 
     @property
     def models(self) -> list[Any]:
-        """The resulting models as `pycolmap.Reconstruction`, the largest first."""
+        """The models as `pycolmap.Reconstruction`: refined, or the inputs unchanged where the guard kept these."""
         return [model.native for result in self.results for model in result.kept]
 
     @property
@@ -56,10 +53,10 @@ def refine_colmap(
 ) -> RefinedColmap:
     """A COLMAP model with better poses: `model` is its folder, a `pycolmap.Reconstruction`, or a list of those.
 
-    `depth`: folder of sensor depth images named as the colour images, `depth_scale` stored units to the metre. Without
-    `out` nothing is written; with it a refinement that was stopped goes on (that of models in memory begins anew), and
-    another one is replaced where it may `overwrite`. `dask` is as of `run`. Raises `HodgeError` (see `errors`) for
-    whatever the user can mend.
+    `depth`: folder of sensor depth images named as the colour images, in `depth_scale` stored units to the metre.
+    `out`: the run folder, in which a stopped refinement goes on (one of models in memory begins again); without it
+    nothing is written. `force` writes a worse result too, `overwrite` replaces another refinement in `out`, `dask` is
+    as of `run`. Raises `HodgeError` (see `errors`) for whatever the user can mend.
     """
     given = {"database": database, "images": images, "depth": depth, "depth_scale": depth_scale}
     sets = [f"model.{name}={value}" for name, value in given.items() if value is not None]
@@ -78,7 +75,7 @@ def run_refinement(
     watcher: Watcher | None = None,
     dask: str | None = None,
 ) -> RefinedColmap:
-    """The same with the options bound already."""
+    """`refine_colmap` with bound options."""
     is_path = isinstance(model, (str, Path))
     options = replace(options, source=str(model) if is_path else None)
     given = Path(model) if is_path else model if isinstance(model, (list, tuple)) else [model]
@@ -93,9 +90,7 @@ def run_refinement(
 
 
 def models_key(models: Sequence[TrackedModel], options: ModelRefinement, steps: Store) -> str:
-    """The key of models under these options: name, size and time of every file; of models in memory, one that no other
-    has.
-    """
+    """A key of models under these options, by path, size and time of every file; a random one of models in memory."""
     if not all(model.files for model in models):
         return uuid.uuid4().hex
     files = [file for model in models for file in (*model.files, *model.measurements)]

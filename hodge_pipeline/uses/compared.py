@@ -1,4 +1,4 @@
-"""Two runs side by side: what was measured and chosen, how far their poses are apart; as a page and a recording."""
+"""Compare two runs: their measures, options and the distance of their poses; as tables, a page and a recording."""
 
 from __future__ import annotations
 
@@ -30,20 +30,24 @@ from hodge_pipeline.types.ply import read_model
 from hodge_pipeline.types.text import counted
 
 FEWEST_SHARED = 3
+"""Shared frames that fix the alignment of the runs."""
 SAME = 0.005
-"""A relative difference that a whole per cent does not show."""
+"""A relative difference that whole per cents do not show."""
 NOTHING_M = 1e-6
-MODELS = ("mesh", "cloud")
+"""A distance of poses below which they are the same: rounding."""
+SHOWN_MODELS = ("mesh", "cloud")
+"""Fused models that are shown, the first that a run has."""
 
-Measure: TypeAlias = Callable[[Report], float | None]
+Quantity: TypeAlias = Callable[[Report], float | None]
+"""Gives a number of a report, None where it was not measured."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two runs by their `names`, B laid onto A: `a_poses`, `b_poses (S, 4, 4)` of the frames that both have a pose of,
-    `a_from_b (4, 4)`.
+    """Two runs by their `names`, B rigidly aligned to A by the S frames that both have a pose of.
 
-    `apart_m (S,)` is the distance of the positions. Without enough shared frames there are none, and no motion.
+    `a_poses`, `b_poses (S, 4, 4)` are in the world of A, `apart_m (S,)` metres between their positions, `a_from_b`
+    moves the world of B. Of fewer than three shared frames S is 0 and `a_from_b` the identity.
     """
 
     a: Run
@@ -56,7 +60,7 @@ class Comparison:
 
     @property
     def reports(self) -> tuple[Report, Report]:
-        """What each run measured."""
+        """The report of each run."""
         return self.a.report, self.b.report
 
     @property
@@ -66,11 +70,11 @@ class Comparison:
 
 
 def compare(a: Run, b: Run) -> Comparison:
-    """Two runs, the second laid onto the first. Raises `WorkspaceError` where one has not ended."""
+    """Two runs, the second aligned to the first. Raises `WorkspaceError` where one has not ended."""
     folders = [run.folder.resolve() for run in (a, b)]
     same = folders[0].name == folders[1].name
     names = (str(a.folder), str(b.folder)) if same else (folders[0].name, folders[1].name)
-    rows_a, rows_b = (_rows(run) for run in (a, b))
+    rows_a, rows_b = (_posed_rows(run) for run in (a, b))
     shared = [(row, rows_b[key]) for key, row in rows_a.items() if key in rows_b] if _may_share(a, b) else []
     rows = np.array(shared, int).reshape(-1, 2)
     a_poses, b_poses = a.poses[rows[:, 0]], b.poses[rows[:, 1]]
@@ -80,8 +84,8 @@ def compare(a: Run, b: Run) -> Comparison:
     return Comparison(a, b, names, a_poses, laid.aligned, laid.aligned[0] @ se3.inverse(b_poses[0]), laid.per_frame_m)
 
 
-def _rows(run: Run) -> dict[tuple[str, float], int]:
-    """The rows of the frames that have a pose, by sequence and stamp."""
+def _posed_rows(run: Run) -> dict[tuple[str, float], int]:
+    """The rows of the frames that have a pose, by sequence and stamp; a single sequence has no name that counts."""
     frames = run.source.frames
     several = len({frame.sequence for frame in frames}) > 1
     known = np.flatnonzero(se3.has_pose(run.poses)).tolist()
@@ -89,7 +93,7 @@ def _rows(run: Run) -> dict[tuple[str, float], int]:
 
 
 def _may_share(a: Run, b: Run) -> bool:
-    """Whether equal stamps mean equal frames: a clock's do; numbers of frames in sources alike in name or length."""
+    """Whether equal stamps are equal frames: of clocks; of frame numbers if the sources agree in name or length."""
     if all(is_clock(np.array([frame.stamp_s for frame in run.source.frames])) for run in (a, b)):
         return True
     one, two = a.report.source, b.report.source
@@ -97,7 +101,7 @@ def _may_share(a: Run, b: Run) -> bool:
 
 
 def tables(comparison: Comparison) -> tuple[Table, ...]:
-    """What was measured of both runs, and the options in which their recipes differ."""
+    """A table of the quantities of both runs, and one of the options in which their recipes differ."""
     measured = Table("Measured", ("what", *comparison.names, "B against A"), tuple(_measured(comparison)))
     a, b = (yaml_file.read(run.folder / RECIPE_FILE).data for run in (comparison.a, comparison.b))
     options = tuple(_changed_options(a, b))
@@ -106,49 +110,53 @@ def tables(comparison: Comparison) -> tuple[Table, ...]:
 
 
 def _measured(comparison: Comparison) -> Iterator[tuple[str, ...]]:
+    """The rows of the first table: label, value of A, value of B, change from A to B."""
     a, b = comparison.reports
     floor_m = floor_of(comparison.a.poses[:, :3, 3], comparison.b.poses[:, :3, 3])
     yield "frames", str(a.source.frames), str(b.source.frames), ""
-    for label, measure, is_length in _MEASURES:
-        before, after = _known(measure(a)), _known(measure(b))
+    for label, quantity, is_length in _QUANTITIES:
+        before, after = _finite(quantity(a)), _finite(quantity(b))
         if before is not None or after is not None:
             floor = floor_m if is_length else 0.0
             cells = (_value(value, is_length, floor) for value in (before, after))
-            yield label, *cells, _change(before, after, floor)
+            yield label, *cells, _change_in_words(before, after, floor)
     if len(apart := comparison.apart_m):
         yield "poses apart, mean of the shared frames", "", _apart(float(apart.mean())), ""
         yield "poses apart, largest", "", _apart(float(apart.max())), ""
 
 
-def _known(value: float | None) -> float | None:
+def _finite(value: float | None) -> float | None:
     return None if value is None or not np.isfinite(value) else value
 
 
-def _error(what: str, name: str = "") -> Measure:
-    """An error of the poses of this name, by default the last ones."""
+def _error(what: str, name: str = "") -> Quantity:
+    """A field of the trajectory error of the poses of this name, by default the result."""
 
-    def measure(report: Report) -> float | None:
+    def of(report: Report) -> float | None:
         rows = (row for row in report.trajectories if row.name == (name or report.after))
         return next((float(getattr(row, what)) for row in rows), None)
 
-    return measure
+    return of
 
 
-def _score(kind: str, what: str) -> Measure:
-    def measure(report: Report) -> float | None:
+def _score(kind: str, what: str) -> Quantity:
+    """A field of the result's scores on a kind of graph."""
+
+    def of(report: Report) -> float | None:
         if report.scores is None or report.after not in report.scores.names:
             return None
         row = report.scores.names.index(report.after)
         return next((float(getattr(one, what)[row]) for one in report.scores.graphs if one.kind == kind), None)
 
-    return measure
+    return of
 
 
-def _graph(measure: Callable[[GraphSummary], int]) -> Measure:
-    return lambda report: None if report.graph is None else measure(report.graph)
+def _graph(count: Callable[[GraphSummary], int]) -> Quantity:
+    """A count of the viewing graph."""
+    return lambda report: None if report.graph is None else count(report.graph)
 
 
-_MEASURES: tuple[tuple[str, Measure, bool], ...] = (
+_QUANTITIES: tuple[tuple[str, Quantity, bool], ...] = (
     ("error of the trajectory (ATE)", _error("ate_rmse_m"), True),
     ("… of the odometry", _error("ate_rmse_m", "odometry"), True),
     ("error from frame to frame (RPE)", _error("rpe_translation_m"), True),
@@ -162,6 +170,7 @@ _MEASURES: tuple[tuple[str, Measure, bool], ...] = (
     ("CPU time, s", lambda report: sum(stage.cpu_s for stage in report.stages) or None, False),
     ("peak memory, MB", lambda report: max((stage.peak_mb for stage in report.stages), default=None), False),
 )
+"""Label, quantity, and whether it is a length in metres."""
 
 
 def _value(value: float | None, is_length: bool, floor: float) -> str:
@@ -174,7 +183,8 @@ def _apart(metres: float) -> str:
     return "0" if metres < NOTHING_M else length(metres)
 
 
-def _change(a: float | None, b: float | None, floor: float) -> str:
+def _change_in_words(a: float | None, b: float | None, floor: float) -> str:
+    """The change from a to b in per cent, "same" where it is within half a per cent or the floor."""
     if a is None or b is None:
         return ""
     if not sign_of(a, b, max(SAME * abs(a), floor)):
@@ -183,7 +193,7 @@ def _change(a: float | None, b: float | None, floor: float) -> str:
 
 
 def _changed_options(a: Any, b: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
-    """Options that differ; of two stages, which have options of their own, the names."""
+    """(key, value of A, value of B) of options that differ; of different stages the names alone."""
     if isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
         a, b = ({str(number): each for number, each in enumerate(one, start=1)} for one in (a, b))
     if isinstance(a, Mapping) and isinstance(b, Mapping) and a.get("stage") == b.get("stage"):
@@ -195,14 +205,17 @@ def _changed_options(a: Any, b: Any, key: str = "") -> Iterator[tuple[str, str, 
 
 
 def _named(value: Any) -> str:
-    """An option's value in a cell: of a stage its name."""
+    """The text of an option's value: of a stage its name."""
     if isinstance(value, Mapping) and "stage" in value:
         return str(value["stage"])
     return ", ".join(map(_named, value)) if isinstance(value, list) else "–" if value is None else str(value)
 
 
 def write_comparison(folder: Path, comparison: Comparison) -> tuple[Path, Path]:
-    """Write `compare.html` and `compare.rrd` into a folder, made if it is not there, and give back their paths."""
+    """The paths of `compare.html` and `compare.rrd`, written into a folder that is made if it is not there.
+
+    Raises `WorkspaceError` where they cannot be written.
+    """
     html, recording = folder / "compare.html", folder / "compare.rrd"
     models = _model(comparison.a, np.eye(4)), _model(comparison.b, comparison.a_from_b)
     make_folder(folder)
@@ -217,8 +230,8 @@ def write_comparison(folder: Path, comparison: Comparison) -> tuple[Path, Path]:
 
 
 def _model(run: Run, world_from_run: Floats) -> Model | None:
-    """The fused scene in the common world."""
-    path = next((run.models[name] for name in MODELS if name in run.models), None)
+    """The fused model of a run in the common world; None without one."""
+    path = next((run.models[name] for name in SHOWN_MODELS if name in run.models), None)
     if path is None:
         return None
     model = read_model(path)
@@ -249,7 +262,7 @@ def _page(comparison: Comparison, models: tuple[Model | None, Model | None]) -> 
 
 
 def _paths(comparison: Comparison) -> Report:
-    """A report that holds nothing but what the plots need."""
+    """A report with nothing but the aligned trajectories, which the plots take."""
     named = zip(comparison.names, (comparison.a_poses, comparison.b_poses), strict=True)
     pictures = Pictures(
         paths_of({name: poses for name, poses in named if len(poses)}),
@@ -260,6 +273,7 @@ def _paths(comparison: Comparison) -> Report:
 
 
 def _sides(comparison: Comparison, models: tuple[Model | None, Model | None]) -> tuple[Picture, ...]:
+    """Both models from the same sides; none where one is missing or the runs share too few frames."""
     first, second = models
     if first is None or second is None or not len(comparison.a_poses) or not len(first.points_in_world):
         return ()

@@ -1,4 +1,4 @@
-"""A run or a pose-graph file diagnosed: what is judged, and what follows from it."""
+"""Diagnose a run or a pose-graph file: verdicts, advice, commands to type and pairs to register next."""
 
 from __future__ import annotations
 
@@ -31,17 +31,20 @@ if TYPE_CHECKING:
     from hodge_pipeline.report.contents import Report
     from hodge_pipeline.run_folder import Run
 
-SUGGESTED, REGISTERED = 12, 6
-"""Pairs that are ranked, and those that a command to type names."""
-COMMANDED = 3
-"""Edges at most that a command to type names."""
+SUGGESTED, COMMANDED_PAIRS = 12, 6
+"""Pairs that are suggested, and those at most that a command to type registers."""
+COMMANDED_EDGES = 3
+"""Edges at most that a command to type disables: more are left to `--robust`."""
 
 
 @dataclass(frozen=True)
-class Subject:
-    """A graph to judge. A run also has its frames and clouds; `edges` are the graph's, some of them off by hand; pairs
-    (P, 2) were `tried` in vain; `harmless` says why its wrong edges need not be disabled; without
-    `has_metres` lengths are in a unit of their own.
+class DiagnosisSubject:
+    """A graph to judge.
+
+    - `edges (E,)`: the table of its edges, with those that are disabled by hand.
+    - `tried (P, 2)`: pairs that were registered and rejected; `frames`, `clouds`: of a run alone.
+    - `harmless`: why its wrong edges need not be disabled, "" where they need.
+    - `has_metres`: False where lengths are in a unit of their own.
     """
 
     path: Path
@@ -60,17 +63,17 @@ class Subject:
 
     @property
     def disabled(self) -> Bools:
-        """The edges (E,) that are off by hand."""
+        """The edges (E,) that are disabled by hand."""
         return np.asarray(self.edges.status == DISABLED)
 
     @property
     def left_out(self) -> Bools:
-        """The edges (E,) of a file that a robust solve of it left out."""
+        """The edges (E,) of a solved file, not of a run, that its robust solve left out."""
         return np.asarray((self.edges.status == IGNORED) & (not self.is_run))
 
 
-def open_subject(path: Path, trust: str | None = None) -> Subject:
-    """The graph of a run's last round, or of a file that a reader knows. Raises `HodgeError` where there is none.
+def open_subject(path: Path, trust: str | None = None) -> DiagnosisSubject:
+    """The graph of a run's last round, or of a pose-graph file. Raises `HodgeError` where there is none.
 
     `trust`: which edges are a backbone, in place of what the run's recipe says.
     """
@@ -85,25 +88,27 @@ def open_subject(path: Path, trust: str | None = None) -> Subject:
     return replace(subject, options=replace(subject.options, trust=trust), harmless="")
 
 
-def _file_subject(path: Path) -> Subject:
+def _file_subject(path: Path) -> DiagnosisSubject:
+    """A pose graph, with the edges that were ignored where the path is the folder of a solve."""
     source = read_graph(path)
     assert source.graph is not None
     name = path.stem if path.is_file() else path.name
     edges = Edges.measured(source.graph)
     if (path / SOLVED).is_file() and len(solved := read_edges(path / EDGES)[0]) == len(edges):
         edges = edges.put(solved.status == IGNORED, status=IGNORED)
-    return Subject(
+    return DiagnosisSubject(
         path, name, source.graph, _edited(path, source.graph, edges), notes=source.notes, has_metres=source.in_metres
     )
 
 
-def _run_subject(path: Path, run: Run) -> Subject:
-    report = run.report  # raises where the run has not ended
+def _run_subject(path: Path, run: Run) -> DiagnosisSubject:
+    """The last round of a run. Raises `WorkspaceError` where it has not ended."""
+    report = run.report
     last, recipe = run.result, run.recipe
     edges = _edited(path, last.graph, last.graph_edges)
     as_solved = np.array_equal(edges.status, last.graph_edges.status)
     frames, notes = run.key_frames_with_images()
-    return Subject(
+    return DiagnosisSubject(
         path,
         path.resolve().name,
         last.graph,
@@ -120,7 +125,7 @@ def _run_subject(path: Path, run: Run) -> Subject:
 
 
 def _harmless(report: Report) -> str:
-    """Why a run is as good without its wrong edges disabled; empty where they bend poses, or nobody weighed them."""
+    """Why the wrong edges of a run do no harm; "" where they move poses, or the run did not measure that."""
     if report.wrong_edges is None or report.wrong_edges.matters(report.scale):
         return ""
     moved = report.length(max(report.wrong_edges.moved_m, NOTHING_MOVED_M * report.scale))
@@ -128,7 +133,7 @@ def _harmless(report: Report) -> str:
 
 
 def _edited(path: Path, graph: ViewGraph, edges: Edges) -> Edges:
-    """The edges of the graph as the edits in a folder have them by now."""
+    """The edges with those disabled that the present edits in the folder disable, and no others."""
     edges = edges.put(edges.status == DISABLED, status=USED)
     for pair in read_history(path).disabled if path.is_dir() else ():
         edges = edges.put(joining(graph.vertex_ids, graph.edges, pair), status=DISABLED)
@@ -137,9 +142,9 @@ def _edited(path: Path, graph: ViewGraph, edges: Edges) -> Edges:
 
 @dataclass(frozen=True)
 class Diagnosed:
-    """A subject with its diagnosis, advice (E,), energy, the commands to type and the pairs to register next."""
+    """A subject with its diagnosis, the advice on each edge (E,), the energy of its parts, and what to do next."""
 
-    subject: Subject
+    subject: DiagnosisSubject
     diagnosis: Diagnosis
     advice: tuple[str, ...]
     energy: tuple[EnergyRow, ...]
@@ -153,13 +158,13 @@ class Diagnosed:
         return in_unit(sentence(self.subject.graph, self.diagnosis), self.subject.has_metres)
 
     @property
-    def rows(self) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
-        """The edges, the worst first."""
+    def rows(self) -> Ints:
+        """The rows (E,) of the edges, the worst first."""
         return ranked(self.diagnosis)
 
 
-def diagnose_subject(subject: Subject) -> Diagnosed:
-    """The verdicts, and what follows from them."""
+def diagnose_subject(subject: DiagnosisSubject) -> Diagnosed:
+    """The verdicts on every edge, and what follows from them."""
     found = diagnose(subject.graph, subject.options)
     found = replace(found, reason=tuple(in_unit(reason, subject.has_metres) for reason in found.reason))
     pieces = int(found.piece.max(initial=-1)) + 1
@@ -184,8 +189,8 @@ def diagnose_subject(subject: Subject) -> Diagnosed:
     return Diagnosed(subject, found, told, energy, commands, notes, suggestions)
 
 
-def _overlapping(subject: Subject, found: Diagnosis) -> Ints | None:
-    """The pairs of a run that see something in common at the robust poses."""
+def _overlapping(subject: DiagnosisSubject, found: Diagnosis) -> Ints | None:
+    """The pairs (P, 2) of a run whose frames overlap at the robust poses; None without frames and clouds."""
     if subject.clouds is None or not subject.frames:
         return None
     from hodge_pipeline.start.unordered.pieces import laid_apart
@@ -195,13 +200,14 @@ def _overlapping(subject: Subject, found: Diagnosis) -> Ints | None:
 
 
 def _beside_kept(graph: ViewGraph, found: Diagnosis) -> Bools:
-    """Wrong edges (E,) whose two views another edge joins that is kept: no pair of names tells them apart."""
+    """Wrong edges (E,) parallel to a kept one: disabling their pair of names would take out both."""
     low, high = np.sort(graph.edges, axis=1).T
     pair = low * graph.vertex_count + high
     return np.asarray((found.verdict == WRONG) & np.isin(pair, pair[found.kept]))
 
 
-def _side_by_side(subject: Subject, found: Diagnosis) -> tuple[str, ...]:
+def _side_by_side(subject: DiagnosisSubject, found: Diagnosis) -> tuple[str, ...]:
+    """A note on wrong edges parallel to kept ones, where there are any."""
     rows = np.flatnonzero(_beside_kept(subject.graph, found))
     if not len(rows):
         return ()
@@ -212,7 +218,8 @@ def _side_by_side(subject: Subject, found: Diagnosis) -> tuple[str, ...]:
     )
 
 
-def _commands(subject: Subject, found: Diagnosis, suggestions: Suggestions) -> tuple[str, ...]:
+def _commands(subject: DiagnosisSubject, found: Diagnosis, suggestions: Suggestions) -> tuple[str, ...]:
+    """What to type next: disable wrong edges, or else register pairs, and solve; nothing where all is well."""
     used = (found.verdict == WRONG) & ~subject.disabled & ~subject.left_out
     beside = _beside_kept(subject.graph, found)
     meant = used & ~beside & (not subject.harmless)
@@ -221,10 +228,10 @@ def _commands(subject: Subject, found: Diagnosis, suggestions: Suggestions) -> t
     wrong = pair_names(subject.graph.vertex_ids, subject.graph.edges[rows])
     if not subject.is_run:
         trust = ("--trust", subject.options.trust) if subject.options.trust != AUTO else ()
-        left_out = len(wrong) > COMMANDED or bool((used & beside).any())
+        left_out = len(wrong) > COMMANDED_EDGES or bool((used & beside).any())
         off = ("--robust", *trust) if left_out else [word for pair in wrong for word in ("--disable", pair)]
         return (command("hodge", "solve", subject.path, "--out", "solved.g2o", *off),) if off else ()
-    useful = suggestions.pairs[suggestions.score >= subject.suggestions.min_gain][:REGISTERED]
+    useful = suggestions.pairs[suggestions.score >= subject.suggestions.min_gain][:COMMANDED_PAIRS]
     if not wrong and not len(useful):
         return ()
     by_word = np.array_equal(meant, (subject.edges.verdict == WRONG) & ~subject.disabled)

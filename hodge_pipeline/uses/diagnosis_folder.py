@@ -1,4 +1,4 @@
-"""A diagnosis in a folder: its table, poses, page and recording."""
+"""Write a diagnosis into a folder: table, poses, page and recording."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.workspace import make_folder
 from hodge_pipeline.types import Source
-from hodge_pipeline.uses.diagnosed import Diagnosed, Subject
+from hodge_pipeline.uses.diagnosed import Diagnosed, DiagnosisSubject
 
 PICTURED, LEAST_PICTURED = 6, 2
+"""Edges that the page shows in pictures: those that are not consistent, at most and at least so many."""
 
 
 def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) -> None:
-    """`edges.csv`, `poses.tum`, `diagnosis.html` and `diagnosis.rrd` in a folder, made if it is not there."""
+    """Write `edges.csv`, `poses.tum`, `diagnosis.html` and `diagnosis.rrd` into a folder, made if it is not there."""
     make_folder(out)
     subject, found = diagnosed.subject, diagnosed.diagnosis
     residuals = {"residual_m": found.residual_m, "residual_rad": np.deg2rad(found.residual_deg)}
@@ -40,8 +41,8 @@ def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) 
         write_diagnosis(out / "diagnosis.rrd", identity, subject.graph, placed, found)
 
 
-def _write_poses(path: Path, subject: Subject, found: Diagnosis) -> None:
-    """The robust poses by the numbers of their vertices."""
+def _write_poses(path: Path, subject: DiagnosisSubject, found: Diagnosis) -> None:
+    """Write the robust poses as TUM, their stamps the numbers of the vertices."""
     trajectory = vertex_trajectory(subject.graph, found.world_from_cam)
     registry.load("writers", "tum")().write(path, Source(subject.name, subject.path, trajectory=trajectory))
 

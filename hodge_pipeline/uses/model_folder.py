@@ -26,14 +26,15 @@ from hodge_pipeline.store.workspace import REFINEMENT, Workspace
 from hodge_pipeline.types import Source, Trajectory
 
 MODELS = "sparse"
+"""The folder of the models, as COLMAP calls it."""
 REFUSAL = "holds another refined model ({change}): --overwrite replaces it"
 
 
 @contextmanager
 def model_workspace(out: Path | None, options: ModelRefinement, *, overwrite: bool) -> Iterator[Workspace]:
-    """The folder of a refinement with its stages; for the time of the body alone, where there is no `out`.
+    """The workspace of a refinement, in a temporary folder without `out`.
 
-    Raises `WorkspaceError` where the folder holds something else, or is the input itself.
+    Raises `WorkspaceError` where `out` holds something else, or the input model.
     """
     model = None if options.source is None else Path(options.source).resolve()
     if out is not None and model is not None and out.resolve() in (model, *model.parents):
@@ -51,7 +52,7 @@ def write_run_folder(
     options: ModelRefinement,
     cost: Cost,
 ) -> None:
-    """Write it all; the models in one step, so that the folder holds those of one run."""
+    """Write models, tables, report and recording. Raises `WorkspaceError` where `out` cannot be written."""
     try:
         models = [model for result in results for model in result.kept]
         _write_models(out, models)
@@ -63,6 +64,7 @@ def write_run_folder(
 
 
 def _write_models(out: Path, models: Sequence[TrackedModel]) -> None:
+    """Replace the models in one step, so that the folder never mixes two runs; kept inputs are copied byte for byte."""
     draft = Path(tempfile.mkdtemp(dir=out, prefix=f".{MODELS}."))
     try:
         for number, model in enumerate(models):
@@ -83,7 +85,7 @@ def _write_models(out: Path, models: Sequence[TrackedModel]) -> None:
 
 
 def _record(out: Path, first: RefinedModel) -> None:
-    """The recording of the first result, which has most images: its poses before and after, its edges, the solve."""
+    """Record the first result, which has most images: poses before and after, edges, the solve."""
     sets = {"start": first.start.world_from_body, "refined": first.model.world_from_body}
     solved = first.solved
     graph, solution = (None, None) if solved is None else (solved.graph, solved.solution)
@@ -91,6 +93,7 @@ def _record(out: Path, first: RefinedModel) -> None:
 
 
 def _write_tables(out: Path, results: Sequence[RefinedModel]) -> None:
+    """Write poses and edges, of each result a file: `poses.tum`, or `poses-0.tum`, … of several."""
     for number, result in enumerate(results):
         suffix = "" if len(results) == 1 else f"-{number}"
         frames = [frame for model in result.kept for frame in model.frames]

@@ -42,10 +42,12 @@ def run(
 ) -> Run:
     """Run a recipe (its name, its file or itself) into the folder `out`, going on where an earlier run stopped.
 
-    A `source` may be opened already; a run of frames that are in memory cannot be resumed by another process.
-    `live` is the address of a Rerun viewer that shows the run as it happens; `dask` that of a Dask scheduler whose
-    workers see the same files, and which is trusted to run code here. Input that changes during the run is noted at its
-    end: by sizes and times, and with `strict` by hashes of every file.
+    - `source`: a path, or a source that is open; frames in memory cannot be resumed by another process.
+    - `overwrite`: replace the run of another recipe in `out`.
+    - `live`: the address of a Rerun viewer that shows the run as it happens.
+    - `dask`: the address of a Dask scheduler whose workers see the same files; it is trusted to run code here.
+    - `strict`: notice input that changes during the run by hashes of every file, not by sizes and times alone.
+
     Raises `HodgeError` (see `errors`) for whatever the user can mend.
     """
     if isinstance(recipe, str):
@@ -64,16 +66,16 @@ def run(
 
 
 def _for_workers(path: Path, dask: str | None) -> Path:
-    """The path as the workers of a cluster must be told it, which start from folders of their own."""
+    """The path, absolute where workers of a cluster read it: they run in other folders."""
     return path.absolute() if dask else path
 
 
 @plugin_errors()
 def solve_again(folder: Path | str, *, watcher: Watcher | None = None, dask: str | None = None) -> Run:
-    """Solve and fuse a finished run once more, with the edits in its folder, and bring all that it left up to date.
+    """Solve and fuse a finished run again with the edits in its folder, and bring everything in it up to date.
 
-    Nothing is registered and no score is measured again: `run` with the same recipe does that. `dask` is as of `run`.
-    Raises `HodgeError`.
+    Only pairs that edits add are registered; scores are not measured again, which `run` with the same recipe does.
+    `dask` is as of `run`. Raises `HodgeError`.
     """
     folder = _for_workers(Path(folder), dask)
     listed_edges(folder)
@@ -111,7 +113,7 @@ class _Run:
         return self._written(job, found)
 
     def _read(self) -> tuple[Source, Fingerprints]:
-        """The source, opened, and what its files are like now; its images stay on disk."""
+        """The source, opened, and the fingerprints of its files; images stay on disk."""
         path = self.recipe.source.path
         if path is None:
             raise RecipeError("source.path: the recipe names no source: give one (--source PATH)")
@@ -130,7 +132,7 @@ class _Run:
         return with_truth(source, self.recipe.evaluation.truth, self.store), prints
 
     def _written(self, job: Job, found: Computed) -> Run:
-        """The run, once its files are in its folder."""
+        """Write report, poses and models into the folder; the finished run."""
         scene, rounds = found.scene, found.rounds
         report = run_files.write(
             self.folder, job.recipe, self.store, scene, rounds, found.poses, found.models, found.scores, found.refined

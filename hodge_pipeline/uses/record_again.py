@@ -1,4 +1,4 @@
-"""The recording of a run made again, with other options, from what its folder holds."""
+"""Make the recording of a run again, with other options, from what its folder holds."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from hodge_pipeline.store.workspace import holding
 from hodge_pipeline.types import Source
 
 PARTS = "recording"
-"""The folder of the parts, which depend on the level and are not those that the run made."""
+"""The folder of the recording's steps: they depend on its options, so the run's own are not replaced."""
 
 
 def record_again(folder: Path, options: Mapping[str, Any], watcher: Watcher | None = None) -> tuple[Path, bool]:
-    """The recording of a run made again with other options (see `RecordingOptions`): where it lies, and whether the run
-    had ended. A run that was killed is recorded as far as it came.
+    """Record a run again with other `RecordingOptions`; the path of the recording, and whether the run has ended.
 
-    Nothing is computed again. Images are recorded where the source is still there.
+    Nothing is computed again. A run that was killed is recorded as far as it came; images, where the source is still
+    there. Raises `WorkspaceError` for no run, one in progress, or options that record nothing.
     """
     check_layout(folder)
     run = Run.load(folder)
@@ -47,7 +47,7 @@ def record_again(folder: Path, options: Mapping[str, Any], watcher: Watcher | No
 
 
 def _with_images(run: Run, store: Store) -> Source:
-    """The key frames of the run, with their images where the source that they came from is still what it was."""
+    """The key frames of the run, with their images where the source is unchanged."""
     opened, reader, complaint = run.reopened()
     store.note(*complaint)
     source = run.source if opened is None else remembered(opened, reader, store, fingerprints(opened.files))
@@ -57,6 +57,7 @@ def _with_images(run: Run, store: Store) -> Source:
 
 
 def _record(run: Run, recording: Recording) -> None:
+    """Everything after the first round, in the order in which the run recorded it."""
     for number, one in enumerate(run.rounds[1:], start=1):
         recording.round(number, one)
     if (run.result.edges.verdict != "").any():

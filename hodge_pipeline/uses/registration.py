@@ -36,7 +36,7 @@ def register(
 ) -> Registration:
     """The motion `i_from_j` that lays `source` (j) onto `target` (i), with its information (6, 6), fitness and RMSE.
 
-    The guess `i_from_j (4, 4)` is the identity where none is given; how far off it may be is the registrar's matter.
+    The guess `i_from_j (4, 4)` defaults to the identity; how far off it may be depends on the registrar.
     `registrar` is a name (`hodge stages registration`), with `options` such as `distances_m=(1.0, 0.3)`, or a stage.
     Lengths are metres. The information is calibrated on clouds with one point a voxel: down-sample dense ones first.
     Clouds without correspondences give the guess back, with `converged` False. Raises `SourceError` for what is no
@@ -55,10 +55,10 @@ def register_clouds(
     registrar: str | Registrar = "gicp",
     **options: Any,
 ) -> Edges:
-    """A table with a registration of each of the `pairs (P, 2)`, rows (i, j) of the clouds; see `register`.
+    """A table of registrations, one of each of the `pairs (P, 2)`, rows (i, j) of the clouds; see `register`.
 
-    `i_from_j (P, 4, 4)` are the guesses. `edges.as_graph(ids)` is the viewing graph that `diagnose` and the solvers
-    take.
+    `i_from_j (P, 4, 4)` are the guesses. `edges.as_graph(ids)` is the viewing graph that `diagnose` and solvers take.
+    Raises as `register`, and `GraphError` for a pair without a cloud.
     """
     rows = np.asarray(pairs, np.int64).reshape(-1, 2)
     stage = stage_of("registration", registrar, options, "register_clouds")
@@ -67,6 +67,7 @@ def register_clouds(
 
 
 def _register(clouds: Sequence[Cloud], pairs: Ints, guesses: Floats | None, stage: Registrar) -> list[Registration]:
+    """The registration of each pair (P, 2) from its guess (P, 4, 4); each cloud is prepared once."""
     if len(pairs) and (pairs.min() < 0 or pairs.max() >= len(clouds)):
         raise GraphError(f"pairs name cloud {pairs.max()} or {pairs.min()}: give rows from 0 to {len(clouds) - 1}")
     motions = np.tile(np.eye(4), (len(pairs), 1, 1)) if guesses is None else np.asarray(guesses, float)
@@ -89,7 +90,7 @@ def _cloud(given: Cloud, row: int) -> PointCloud:
 
 
 def _column(given: Any, name: str, count: int) -> Floats32 | None:
-    """What Open3D's cloud has of each point; None where it has nothing."""
+    """A column (N, 3) of Open3D's cloud; None where it has none."""
     values = np.asarray(getattr(given, name, ()), np.float32)
     return values if count and values.shape == (count, 3) else None
 

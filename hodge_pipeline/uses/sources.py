@@ -14,10 +14,10 @@ from hodge_pipeline.types import Source
 
 
 def open_source(path: Path | str, reader: str | FrameReader | None = None, **options: Any) -> Source:
-    """What is at a path: lazy frames, a trajectory, a measured graph, whatever of these its format holds.
+    """The source at a path: lazy frames, a trajectory, a measured graph, as far as its format holds them.
 
-    `reader` is the name of a format (`hodge stages readers`), with `options` such as `every=10`, or a reader itself;
-    without one the reader that is surest of the path opens it. Raises `SourceError`, and `RecipeError` for an unknown
+    `reader` is the name of a format (`hodge stages readers`), with `options` such as `every=10`, or a reader itself; by
+    default the reader that is surest of the path. Raises `SourceError`, and `RecipeError` for an unknown
     reader or option.
     """
     path = Path(path)

@@ -25,14 +25,14 @@ from hodge_pipeline.uses.recipe_run import run as recipe_run
 Array = TypeVar("Array")
 
 FARTHEST_M = 200.0
-"""Metres: no depth sensor has half of its pixels beyond it; a room in millimetres has 1000 and more."""
+"""Median depth that no sensor has; a room in millimetres has 1000 and more."""
 
 
 @dataclass(frozen=True)
 class RefinedTrajectory:
-    """`poses` of the kind that was given (array (N, 4, 4), or Open3D's trajectory), the decision and the report.
+    """`poses` of the type that was given (array (N, 4, 4), or Open3D's trajectory), the decision and the report.
 
-    Where the decision keeps the input, `poses` are the very ones that were given.
+    Where the decision keeps the input, `poses` is the very object that was given.
     """
 
     poses: Any
@@ -48,8 +48,8 @@ def frames_from_images(
 ) -> tuple[Frame, ...]:
     """Frames of images in memory: depths (H, W) in metres, 0 where there is none, and RGB colours (H, W, 3), 8 bit.
 
-    `camera`: ours, or the 3x3 matrix K, as Open3D's `intrinsic.intrinsic_matrix`. Without stamps the frames are
-    one second apart. Raises `SourceError` for depth that cannot be metres and a camera that cannot be one.
+    `camera`: a `Camera`, or the matrix K (3, 3), as Open3D's `intrinsic.intrinsic_matrix`. Without `stamps_s` frames
+    are one second apart. Raises `SourceError` for depth that is not metres, images of other sizes and a wrong camera.
     """
     if not len(depths_m):
         raise SourceError("no depth image given: refinement needs what the frames saw")
@@ -82,12 +82,15 @@ def refine_trajectory(
     watcher: Watcher | None = None,
     dask: str | None = None,
 ) -> RefinedTrajectory:
-    """Poses made better by the frames they belong to, one pose for each frame.
+    """A trajectory refined by the frames that it belongs to, one pose for each frame.
 
-    `poses`: world_from_cam (N, 4, 4), or an `open3d.camera.PinholeCameraTrajectory`. `frames`: a path that a reader
-    opens, or frames (see `frames_from_images`). `recipe`: slam_refine, slam_refine_tum for TUM's folders,
-    slam_refine_scans for scans. `out` keeps the run folder with report and recording; `dask` is as of `run`. Files of
-    poses go to `hodge refine trajectory`. Raises `HodgeError` (see `errors`) for whatever the user can mend.
+    - `poses`: world_from_cam (N, 4, 4), NaN where unknown, or an `open3d.camera.PinholeCameraTrajectory`.
+    - `frames`: a path that a reader opens, or frames (see `frames_from_images`).
+    - `recipe`: slam_refine, slam_refine_tum or slam_refine_scans; by default the one that suits the frames.
+    - `out`: the run folder with report and recording; by default none is kept. `force` writes a worse result too.
+    - `dask` is as of `run`.
+
+    `hodge refine trajectory` takes files of poses. Raises `HodgeError` (see `errors`) for whatever the user can mend.
     """
     open3d = not isinstance(poses, (np.ndarray, list, tuple))
     given = poses_of(poses) if open3d else np.asarray(poses, float)
@@ -107,27 +110,28 @@ def refine_trajectory(
 
 
 def _source(frames: Path | str | Sequence[Frame], poses: Floats) -> Source:
-    opened = guess_reader(Path(frames)).open(Path(frames).absolute()) if isinstance(frames, (str, Path)) else None
-    listed = (
-        tuple(frames) if opened is None and not isinstance(frames, (str, Path)) else opened.frames if opened else ()
-    )
-    if poses.shape != (len(listed), 4, 4):
-        raise SourceError(f"poses of shape {poses.shape} for {len(listed)} frames: give one 4x4 matrix for each frame")
+    """The frames with these poses (N, 4, 4). Raises `SourceError` where there is not one pose for each frame."""
+    if isinstance(frames, (str, Path)):
+        source = guess_reader(Path(frames)).open(Path(frames).absolute())
+    else:
+        source = Source("frames in memory", Path("memory"), tuple(frames))
+    count = len(source.frames)
+    if poses.shape != (count, 4, 4):
+        raise SourceError(f"poses of shape {poses.shape} for {count} frames: give one 4x4 matrix for each frame")
     posed = tuple(
         replace(frame, world_from_cam=pose if np.isfinite(pose).all() else None)
-        for frame, pose in zip(listed, poses, strict=True)
+        for frame, pose in zip(source.frames, poses, strict=True)
     )
-    if opened is not None:
-        return replace(opened, frames=posed)
-    return Source("frames in memory", Path("memory"), posed)
+    return replace(source, frames=posed)
 
 
 def _same(array: Array) -> Array:
+    """The array: a reader of an image in memory that pickles."""
     return array
 
 
 def camera_of(camera: Camera | Floats, height: int, width: int) -> Camera:
-    """The camera of images of this size, from ours or a matrix K (3, 3). Raises `SourceError` for what is none."""
+    """The camera of images of this size, from a `Camera` or K (3, 3). Raises `SourceError` for a wrong one."""
     if not isinstance(camera, Camera):
         k = np.asarray(camera, float)
         if k.shape != (3, 3) or not np.isfinite(k).all() or (k[2] != (0, 0, 1)).any() or k[1, 0]:
@@ -147,7 +151,7 @@ def camera_of(camera: Camera | Floats, height: int, width: int) -> Camera:
 
 
 def check_depths(depths_m: Sequence[Floats32]) -> None:
-    """Raise `SourceError` for the first image that cannot be depth in metres, or has another size than the first."""
+    """Raise `SourceError` for an image that cannot be depth in metres, or has another size than the first."""
     size = np.shape(depths_m[0])
     for row, depth in enumerate(np.asarray(image) for image in depths_m):
         if depth.ndim != 2 or depth.shape != size:

@@ -28,6 +28,7 @@ from hodge_adapters.colmap.scale import depth_ratios
 from hodge_adapters.colmap.ties import held_apart, merge_matched_points
 from hodge_adapters.colmap.uncertainty import standard_errors
 from hodge_pipeline import se3
+from hodge_pipeline.stages import Adjusted
 from hodge_pipeline.types import (
     Bools,
     CloudSet,
@@ -160,6 +161,7 @@ class ColmapModel:
             errors_px=errors_px,
             parallaxes_deg=parallaxes(records)[owners],
             track_lengths=np.diff(records.points.offsets)[owners],
+            point_rows=owners,
         )
 
     def depth_ratios(self) -> Sequence[Floats]:
@@ -301,7 +303,7 @@ class ColmapModel:
         """Of each body's rotation and position (B, 2), radians and units; see `colmap_uncertainty`."""
         return standard_errors(self.records, self.bodies)
 
-    def held_out_errors(self, entries: Bools, adjusts: Literal["nothing", "points", "all"]) -> Floats:
+    def held_out_errors(self, entries: Bools, adjusts: Adjusted) -> Floats:
         """Errors (H,) of these entries of tracks (T,) after an adjustment without them of nothing, the points or all.
 
         An entry whose point too few others would place is left in, and out of the answer.

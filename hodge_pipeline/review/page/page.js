@@ -20,7 +20,7 @@ async function act(name, body = {}) {
   try {
     const found = await ask(name, { revision: state.revision, note: $("note").value, ...body });
     if (["decide", "wrong", "accept", "undo", "redo"].includes(name)) $("note").value = "";
-    tell(found.told || "");
+    tell("");
     show(found.state);
   } catch (error) {
     tell(error.message);
