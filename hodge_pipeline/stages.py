@@ -269,9 +269,9 @@ class TrackedModel(Protocol):
     def quality(self) -> ModelQuality:
         """How well points and images agree."""
 
-    def depth_ratios(self) -> Sequence[Floats]:
-        """For each image with depth, in a few hundred of them: metres that the sensor saw over units that the model
-        has, at the tracked points.
+    def seen_depths(self) -> Sequence[Floats]:
+        """For each image with depth, in a few hundred of them, at the tracked points (K, 3): metres that the sensor
+        saw, units that the model has, and the length of the ray to unit depth.
         """
 
     def seen_points(self) -> CloudSet:

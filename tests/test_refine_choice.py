@@ -17,6 +17,7 @@ from hodge_pipeline.refine.uncertainty import loose, told_apart
 from hodge_pipeline.types import Floats, ModelQuality
 from test_refine_judge import flat, quality
 
+DEPTHS = np.linspace(1.0, 3.0, 20)
 NO_STEPS: Any = None
 """Nothing is to be computed."""
 
@@ -48,8 +49,8 @@ class Model:
     def merged(self) -> Model:
         return self
 
-    def depth_ratios(self) -> list[Floats]:
-        return [np.full(20, self.ratio) for _ in range(10)]
+    def seen_depths(self) -> list[Floats]:
+        return [np.stack([self.ratio * DEPTHS, DEPTHS, np.ones(20)], axis=1) for _ in range(10)]
 
 
 def found(before_px: float, after_px: float, points: int = 40, ratio: float = 1.0, sigma: float = 0.01) -> CandidateSet:
@@ -61,7 +62,7 @@ def found(before_px: float, after_px: float, points: int = 40, ratio: float = 1.
     models = [Model(parts[0]), Model(parts[1], moved=0.9, ratio=ratio, sigmas=(sigma,) * 10)]
     inputs, *costly = costs(parts[:1], parts)
     held_out = SimpleNamespace(held_out=np.zeros((8, 2), np.int64))
-    candidates: Any = [CandidateModel(name, model) for name, model in zip(("as given", "bundle"), models, strict=True)]
+    candidates: Any = [CandidateModel("as given", models[0], holds_poses=True), CandidateModel("bundle", models[1])]
     depth: Any = held_out
     return CandidateSet(inputs, candidates, costly, None, depth, ())
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,14 +13,16 @@ from typer.testing import CliRunner
 import hodge_pipeline
 from hodge_adapters.colmap.content import read_model
 from hodge_adapters.colmap.models import ColmapModels
-from hodge_adapters.colmap.scale import depth_ratios
+from hodge_adapters.colmap.scale import seen_depths
 from hodge_adapters.colmap.tracked import ColmapModel
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import SourceError, WorkspaceError
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.pairs.edits import listed_edges
+from hodge_pipeline.refine.model import _in_the_scale_of
 from hodge_pipeline.refine.scale import metric_scale
+from hodge_pipeline.types import Floats
 from test_readers_colmap import synthetic
 
 NOISE_PX = 0.3
@@ -154,6 +157,48 @@ def test_wrong_tracks_do_not_bend_the_model(tmp_path: Path, share: float) -> Non
     assert off[1] < 0.05 * off[0]
 
 
+def test_points_that_are_wrong_beside_right_poses_are_mended_alone(tmp_path: Path) -> None:
+    model, rng = pycolmap.Reconstruction(noisy(tmp_path)), np.random.default_rng(0)
+    before = {key: frame.rig_from_world.matrix() for key, frame in model.frames.items()}
+    for point in model.points3D.values():
+        point.xyz = point.xyz + rng.normal(scale=0.2, size=3)
+    done = hodge_pipeline.refine_colmap(model, database="none", overrides=FREE)
+    (result,) = done.results
+    assert result.decision.outcome == "refined" and not result.decision.doubt
+    assert result.decision.reason.endswith("by bundle adjustment of points alone")
+    for key, frame in done.models[0].frames.items():
+        np.testing.assert_allclose(frame.rig_from_world.matrix(), before[key], atol=1e-9)
+    done.models[0].update_point_3d_errors()
+    assert done.models[0].compute_mean_reprojection_error() <= 1.001 * error_px(tmp_path / "model")
+
+
+def test_images_that_share_no_points_with_the_others_are_in_doubt() -> None:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 8, 60
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(options)
+    apart = {image.name for image in sorted(model.images.values(), key=lambda one: one.name)[:3]}
+    (whole,) = hodge_pipeline.refine_colmap(model, database="none", overrides=FREE).results
+    assert not whole.decision.doubt
+    seen = {key: [(e.image_id, e.point2D_idx) for e in point.track.elements] for key, point in model.points3D.items()}
+    for key, elements in seen.items():
+        for image_id, column in elements:
+            is_other = (model.images[image_id].name in apart) != (key % 2 == 0)
+            if is_other and model.images[image_id].points2D[column].has_point3D():
+                model.delete_observation(image_id, column)
+    (cut,) = hodge_pipeline.refine_colmap(model, database="none", overrides=FREE).results
+    assert cut.decision.doubt.startswith("in doubt, since 3 images (")
+    assert cut.decision.doubt.endswith("share no points with the others, or too few")
+
+
+def test_positions_that_are_all_one_leave_the_size_as_it_is() -> None:
+    """As of a camera that only turns: they tell no size, and poses of size 0 would be no numbers."""
+    one = se3.from_parts(np.broadcast_to(np.eye(3), (4, 3, 3)), np.zeros((4, 3)))
+    spread = se3.from_parts(np.broadcast_to(np.eye(3), (4, 3, 3)), np.eye(4)[:, :3])
+    start, model = (SimpleNamespace(world_from_body=poses, body_from_cam=one) for poses in (one, spread))
+    assert _in_the_scale_of(start, model) is model  # type: ignore[arg-type]
+
+
 @pytest.mark.filterwarnings("error:Mean of empty slice")
 def test_a_model_of_few_points_is_no_better_for_a_billionth_of_a_pixel() -> None:
     """As two images of one point are: neither is its change of a known size."""
@@ -193,8 +238,8 @@ def spoil(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every bundle adjustment from now on leaves the bodies anywhere."""
     honest = ColmapModel.adjusted
 
-    def adjusted(self: ColmapModel, priors: object = None) -> ColmapModel:
-        model = honest(self, None)
+    def adjusted(self: ColmapModel, priors: object = None, *, move_bodies: bool = True) -> ColmapModel:
+        model = honest(self, None, move_bodies=move_bodies)
         rng = np.random.default_rng(0)
         for frame_id, pose in zip(model.bodies.frame_ids, model.world_from_body, strict=True):
             moved = se3.inverse(pose @ se3.exp(rng.normal(scale=0.3, size=6)))
@@ -268,11 +313,11 @@ def test_without_one_edge_there_are_still_candidates(tmp_path: Path) -> None:
     assert error_px(tmp_path / "out/sparse/0") <= 1.001 * error_px(model)
 
 
-def refuse(*_: object) -> None:
+def refuse(*_: object, **__: object) -> None:
     raise AssertionError("this was done before")
 
 
-def stop(*_: object) -> None:
+def stop(*_: object, **__: object) -> None:
     raise KeyboardInterrupt
 
 
@@ -280,9 +325,9 @@ def counted(patch: pytest.MonkeyPatch, method: str) -> list[object]:
     """One entry for each call of a method of models from now on."""
     calls, honest = list[object](), getattr(ColmapModel, method)
 
-    def call(self: ColmapModel, *arguments: object) -> object:
+    def call(self: ColmapModel, *arguments: object, **named: object) -> object:
         calls.append(self)
-        return honest(self, *arguments)
+        return honest(self, *arguments, **named)
 
     patch.setattr(ColmapModel, method, call)
     return calls
@@ -360,14 +405,21 @@ def test_points_that_one_image_saw_are_kept(tmp_path: Path) -> None:
     assert done.models[0].points3D[lone].track.length() == 1
 
 
+def depths(ratios: Floats, rays: Floats | None = None) -> Floats:
+    """Depths (K, 3) of points with these ratios (K,) of metres to units, by a sensor that may measure along rays."""
+    model = np.random.default_rng(5).permutation(np.linspace(1.0, 4.0, len(ratios)))
+    ray = np.ones(len(ratios)) if rays is None else rays
+    return np.stack([ratios * model * ray, model, ray], axis=1)
+
+
 def test_depth_that_tells_no_scale_is_a_doubt_and_depth_that_cannot_be_read_an_error(tmp_path: Path) -> None:
-    assert metric_scale([]).doubt == "" and metric_scale([np.full(60, 2.0)] * 3).doubt == ""
-    assert metric_scale([np.zeros(0)] * 3).doubt == "not in metres, since depth at only 0 points of 0 images"
+    assert metric_scale([]).doubt == "" and metric_scale([depths(np.full(60, 2.0))] * 3).doubt == ""
+    assert metric_scale([np.zeros((0, 3))] * 3).doubt == "not in metres, since depth at only 0 points of 0 images"
     file = tmp_path / "0.png"
     cv2.imwrite(str(file), np.full((4, 4), 9, np.uint8))
     synthetic(tmp_path)
     with pytest.raises(SourceError, match="0.png: depth must be uint16"):
-        depth_ratios(read_model(tmp_path / "binary")[1], {0: file}, 1000.0, (0,))
+        seen_depths(read_model(tmp_path / "binary")[1], {0: file}, 1000.0, (0,))
 
 
 def test_scale_is_the_median_with_the_error_of_the_images_medians() -> None:
@@ -375,12 +427,24 @@ def test_scale_is_the_median_with_the_error_of_the_images_medians() -> None:
     bias = rng.normal(scale=0.01, size=40)
     ratios = [0.2 * (1 + one + rng.normal(scale=0.03, size=100)) for one in bias]
     ratios[0][:20] = 5.0
-    scale = metric_scale(ratios)
+    scale = metric_scale([depths(one) for one in ratios])
     assert abs(scale.metres_per_unit / 0.2 - 1) < 3 * scale.sigma
     assert 0.001 < scale.sigma < 0.004, "0.01 · 1.25 / √40 = 0.002"
     assert not metric_scale([]).is_observable
-    assert "only 20 points" in metric_scale([np.ones(10), np.ones(10)]).reason
-    assert "other images" in metric_scale([np.exp(rng.normal(scale=0.5, size=100)) for _ in range(10)]).reason
+    assert "only 20 points" in metric_scale([depths(np.ones(10)), depths(np.ones(10))]).reason
+
+
+def test_depth_that_is_not_of_these_images_tells_no_scale() -> None:
+    """Depth of a mirrored or another image of one room is nearer to the points than chance, and tells a wrong scale."""
+    rng = np.random.default_rng(0)
+    right = [0.2 * (1 + rng.normal(scale=0.03, size=100)) for _ in range(10)]
+    for scale, told in ((0.5, True), (0.17, True), (0.03, False)):
+        found = metric_scale([depths(0.2 * np.exp(rng.normal(scale=scale, size=100))) for _ in range(10)])
+        assert ("depth of other images" in found.reason) == told, scale
+    halved = metric_scale([depths(one if row % 3 else one / 2) for row, one in enumerate(right)])
+    assert halved.reason == "the depth of 4 of 10 images is 0.51 times what the others' scale gives"
+    along = metric_scale([depths(one, 1 + 0.3 * rng.random(100)) for one in right])
+    assert along.reason.startswith("depth seems to be measured along rays")
 
 
 def test_lund_door(data_dir: Path, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import hodge_pipeline
 from hodge_adapters.colmap.models import ColmapModels
 from hodge_adapters.colmap.uncertainty import standard_errors
 from hodge_pipeline import se3
-from hodge_pipeline.refine.judge import best, costs
+from hodge_pipeline.refine.judge import best, costs, mends
 from hodge_pipeline.types import ModelQuality
 from test_refine_colmap import FREE, noisy
 
@@ -91,6 +91,22 @@ def test_an_image_that_is_off_is_named_and_the_candidate_not_sound() -> None:
     assert not given.is_sound and right.is_sound
     assert given.images_doubt == "in doubt, since most observations of 1 image (image 3) are more than 4 px off"
     assert not given.doubt and not right.images_doubt
+
+
+def test_observations_that_come_near_are_mended_where_chance_does_not_bring_as_many() -> None:
+    """Few of many weigh nothing in the mean, and are all that tells how two halves lie to each other."""
+    tied = {("image 0", column): 50.0 for column in range(100, 125)}
+    given, mended, other = costs(
+        [quality({**flat(1.0), **tied})],
+        [
+            quality({**flat(0.99), **dict.fromkeys(tied, 1.0)}),
+            quality({**flat(1.0), **dict.fromkeys(list(tied)[:8], 1.0)}),
+        ],
+    )
+    assert mends(given, mended) and not mends(mended, given) and not mends(given, other)
+    spoilt = quality({**flat(0.99), **{key: 9.0 for key in flat(1.0, images=1)}, **dict.fromkeys(tied, 1.0)})
+    before, after = costs([quality({**flat(1.0), **tied})], [spoilt])
+    assert not mends(before, after), "it puts an image off"
 
 
 def test_poses_are_in_doubt_where_most_observations_are_off_whatever_else_fits() -> None:

@@ -97,7 +97,7 @@ class _Candidates:
 
     @property
     def is_settled(self) -> bool:
-        """Whether the best is sound, or two that began at different poses reached one optimum that leaves no image off."""
+        """Whether the best is sound, or two that began at other poses reached one optimum that leaves no image off."""
         lowest = self.costs[self.best]
         rows = [row for row, one in enumerate(self.candidates) if not one.holds_poses and one.name != REPLACED]
         same = [row for row in rows if self.costs[row].px <= (1 + SAME_COST) * lowest.px]
@@ -112,7 +112,7 @@ class _Candidates:
         *,
         move_bodies: bool = True,
     ) -> None:
-        """Adjust a model, as a step, from its own poses or from these (B, 4, 4), which `move_bodies` may hold; a failure
+        """Adjust a model, as a step, from its own poses or from these (B, 4, 4), held without `move_bodies`; a failure
         becomes a note.
         """
         try:

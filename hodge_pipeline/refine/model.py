@@ -76,7 +76,7 @@ def refine_models(
     `SourceError` where none can.
     """
     models, left_out = refinable(models)
-    scales = [metric_scale(model.depth_ratios()) for model in models]
+    scales = [metric_scale(model.seen_depths()) for model in models]
     metric = [in_metres(model, scale) for model, scale in zip(models, scales, strict=True)]
     out = []
     with open_workers(options.executor, dask) as workers:
@@ -130,7 +130,7 @@ def _refine(
     at, chosen = choice.row, found.candidates[choice.row].model
     in_world = start.known_positions is not None
     model = chosen if at == 0 or is_metric or in_world else _in_the_scale_of(start, chosen)
-    final = metric_scale(model.depth_ratios()) if any(scale.is_observable for scale in scales) else scales[0]
+    final = metric_scale(model.seen_depths()) if any(scale.is_observable for scale in scales) else scales[0]
     if final.is_observable and not in_world:
         model, final = model.scaled(final.metres_per_unit), replace(final, metres_per_unit=1.0)
     change = _change(start, scales[0], model, in_world) if len(inputs) == 1 and at else None
@@ -218,7 +218,7 @@ def _metric_poses(found: CandidateSet) -> Floats:
     poses = np.array([[frame.world_from_cam for frame in model.frames] for model in models])
     if len(found.depth.held_out):
         for own, model in zip(poses, models, strict=True):
-            own[:, :3, 3] *= metric_scale(model.depth_ratios()).metres_per_unit
+            own[:, :3, 3] *= metric_scale(model.seen_depths()).metres_per_unit
     return poses
 
 

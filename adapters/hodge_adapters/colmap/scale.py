@@ -32,7 +32,7 @@ def metres_per_unit(
     rows = sorted(sensors)
     picked = np.unique(np.linspace(0, len(rows) - 1, SAMPLED_IMAGES).round().astype(int))
     chosen = {rows[at]: sensors[rows[at]] for at in picked}
-    found = np.concatenate([np.zeros(0), *depth_ratios(model, chosen, units_per_metre, no_depth)])
+    found = _ratios(seen_depths(model, chosen, units_per_metre, no_depth))
     if len(found) < LEAST_POINTS:
         notes.append(f"scale 1 m per unit: only {counted(len(found), 'point has|points have')} sensor depth; set scale")
         return 1.0
@@ -56,7 +56,7 @@ def other_camera_note(
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, SAMPLED_IMAGES).round().astype(int))]
     spreads = {}
     for factor in FOCAL_FACTORS:
-        ratios = [np.zeros(0)]
+        depths = list[Floats]()
         for row in rows.tolist():
             record = model.cameras[model.images[row].camera_id]
             camera = colmap_camera(record)
@@ -69,8 +69,8 @@ def other_camera_note(
                 camera.principal_point_x - HALF_PIXEL,
                 camera.principal_point_y - HALF_PIXEL,
             )
-            ratios += depth_ratios(model, {row: sensors[row]}, units_per_metre, no_depth, given)
-        found = np.concatenate(ratios)
+            depths += seen_depths(model, {row: sensors[row]}, units_per_metre, no_depth, given)
+        found = _ratios(depths)
         spreads[factor] = (
             float(np.median(np.abs(found / np.median(found) - 1))) if len(found) >= LEAST_POINTS else np.inf
         )
@@ -99,14 +99,15 @@ def scaled_graph(graph: ViewGraph, scale: float) -> ViewGraph:
     )
 
 
-def depth_ratios(
+def seen_depths(
     model: Model,
     sensors: Mapping[int, Path],
     units_per_metre: float,
     no_depth: tuple[int, ...],
     camera: tuple[float, float, float, float] | None = None,
 ) -> Sequence[Floats]:
-    """Metres by the sensor over units by the model at the observations of each image (by row), of `MOST_IMAGES` evenly.
+    """For each image (by row), of `MOST_IMAGES` evenly: at its observations (K, 3) metres by the sensor, units by the
+    model, and the length of the ray to unit depth.
 
     `camera`: fx fy cx cy of the depth images; none where their pixels are those of the colour images. Raises
     `SourceError` where none of them can be read.
@@ -114,25 +115,32 @@ def depth_ratios(
     rows = np.array(sorted(sensors), np.int64)
     if len(rows) > MOST_IMAGES:
         rows = rows[np.linspace(0, len(rows) - 1, MOST_IMAGES).round().astype(int)]
-    ratios, faults = [], list[SourceError]()
+    depths, faults = list[Floats](), list[SourceError]()
     for row in rows.tolist():
         try:
             depth = pixels.read_depth(sensors[row], units_per_metre=units_per_metre, no_depth=no_depth)
         except SourceError as fault:  # the frame itself reports it when it is read
             faults.append(fault)
             continue
-        ratios.append(_ratios(model, row, depth, camera))
-    if faults and not ratios:
+        depths.append(_seen_depths(model, row, depth, camera))
+    if faults and not depths:
         raise faults[0]
-    return ratios
+    return depths
 
 
-def _ratios(model: Model, row: int, depth: Floats32, camera: tuple[float, float, float, float] | None) -> Floats:
+def _ratios(depths: Sequence[Floats]) -> Floats:
+    """Metres by the sensor over units by the model, of all images."""
+    found = np.concatenate([np.zeros((0, 3)), *depths])
+    return np.asarray(found[:, 0] / found[:, 1])
+
+
+def _seen_depths(model: Model, row: int, depth: Floats32, camera: tuple[float, float, float, float] | None) -> Floats:
     image = model.images[row]
     record = model.cameras[image.camera_id]
     seen = image.point_ids != NO_POINT
     xyz = positions(model, image.point_ids[seen])
-    expected: Floats = se3.transform(se3.inverse(image.world_from_cam), xyz)[:, 2]
+    in_cam = se3.transform(se3.inverse(image.world_from_cam), xyz)
+    expected: Floats = in_cam[:, 2]
     grid = np.array([depth.shape[1] / record.width, depth.shape[0] / record.height])
     pixels = image.pixels[seen] * grid
     if camera is not None:
@@ -141,5 +149,5 @@ def _ratios(model: Model, row: int, depth: Floats32, camera: tuple[float, float,
     columns, rows = np.floor(pixels).astype(np.int64).T
     good = (columns >= 0) & (rows >= 0) & (columns < depth.shape[1]) & (rows < depth.shape[0]) & (expected > 0)
     measured: Floats = depth[rows[good], columns[good]].astype(np.float64)
-    ratios: Floats = (measured / expected[good])[measured > 0]
-    return ratios
+    ray = np.linalg.norm(in_cam[good], axis=1) / expected[good]
+    return np.stack([measured, expected[good], ray], axis=1)[measured > 0]

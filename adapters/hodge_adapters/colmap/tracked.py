@@ -24,7 +24,7 @@ from hodge_adapters.colmap.priors import Known, body_priors, placing
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import Model
 from hodge_adapters.colmap.resection import resected
-from hodge_adapters.colmap.scale import depth_ratios
+from hodge_adapters.colmap.scale import seen_depths
 from hodge_adapters.colmap.ties import held_apart, merge_matched_points
 from hodge_adapters.colmap.uncertainty import standard_errors
 from hodge_pipeline import se3
@@ -164,13 +164,13 @@ class ColmapModel:
             point_rows=owners,
         )
 
-    def depth_ratios(self) -> Sequence[Floats]:
-        """Sensor depth over model depth at the observations of each image with depth, of a few hundred evenly."""
+    def seen_depths(self) -> Sequence[Floats]:
+        """Depths by sensor and model at the observations of each image with depth, of a few hundred evenly."""
         depth = self.depth
         files = {
             row: depth.files[image.name] for row, image in enumerate(self.records.images) if image.name in depth.files
         }
-        return depth_ratios(self.records, files, depth.units_per_metre, depth.no_depth, depth.camera)
+        return seen_depths(self.records, files, depth.units_per_metre, depth.no_depth, depth.camera)
 
     def seen_points(self) -> CloudSet:
         """The tracked points that each body's images see, in its axes; a point counts once for each body."""
