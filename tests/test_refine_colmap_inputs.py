@@ -156,7 +156,7 @@ def test_tracks_are_not_blamed_for_poses_that_cannot_be_read(tmp_path: Path) -> 
 def test_without_a_scale_nothing_is_in_metres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the consistent solve, so that there are edges: on the page, in plots, in the table, at the terminal."""
     start, out, labels = disturbed(noisy(tmp_path), tmp_path / "start", 8.0, 0.15), tmp_path / "out", list[str]()
-    monkeypatch.setattr("hodge_pipeline.refine.candidates._Weighing.is_settled", False)
+    monkeypatch.setattr("hodge_pipeline.refine.candidates._Candidates.is_settled", False)
     set_label = Axis.set_label_text
     monkeypatch.setattr(Axis, "set_label_text", lambda *a, **k: (labels.append(a[1]), set_label(*a, **k))[1])
     sets = [text for option in FREE for text in ("--set", option)]
