@@ -174,6 +174,18 @@ def test_poses_find_their_frames_by_stamp_number_or_row() -> None:
         match_poses(clock, numbered([10.0, 11.0]), "row", 0.1, "x")
 
 
+def test_poses_without_stamps_for_another_number_of_frames_are_matched_by_request_alone(tmp_path: Path) -> None:
+    """Four rows of KITTI for three frames went to the frames of their row numbers."""
+    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 4)
+    rows = guess_reader(tmp_path / "poses.txt").open(tmp_path / "poses.txt").trajectory
+    assert rows is not None
+    frames = numbered([0.0, 1.0, 2.0])
+    with pytest.raises(SourceError, match="4 poses without stamps for 3 frames: .*--match number"):
+        match_poses(rows, frames, "auto", 0.1, "x")
+    assert match_poses(rows, frames, "number", 0.1, "x").how == "number"
+    assert match_poses(rows, numbered([0.0, 1.0, 2.0, 3.0]), "auto", 0.1, "x").how == "row"
+
+
 FILES = {
     "kept.txt": (TumRewriter, "# mine\n1.50 0 0 0 0 0 0 1 # end\n\n2.50\t1 0 0 0 0 0 1\n"),
     "kept.kitti": (KittiRewriter, "1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 0 0 0 1 0\n"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -68,8 +68,11 @@ def match_poses(trajectory: Trajectory, frames: Sequence[Frame], match: Match, m
 
     Raises `SourceError` where they have nothing in common, or `match` asks for what is not there.
     """
+    rows = len(trajectory)
     usable = se3.has_pose(trajectory.world_from_cam) & np.isfinite(trajectory.stamps_s)
-    trajectory = Trajectory(trajectory.stamps_s[usable], trajectory.world_from_cam[usable])
+    trajectory = replace(
+        trajectory, stamps_s=trajectory.stamps_s[usable], world_from_cam=trajectory.world_from_cam[usable]
+    )
     if not len(trajectory):
         raise SourceError(f"{where}: no pose in it: give a trajectory")
     if match != "auto":
@@ -77,6 +80,12 @@ def match_poses(trajectory: Trajectory, frames: Sequence[Frame], match: Match, m
         if matched is None or not np.isfinite(matched.world_from_cam).any():
             raise SourceError(f"{where}: no frame finds a pose by {match}: {_ranges(trajectory, frames)}")
         return matched
+    if not trajectory.has_stamps and rows != len(frames):
+        raise SourceError(
+            f"{where}: {counted(rows, 'pose')} without stamps for {counted(len(frames), 'frame')}: nothing tells which "
+            "pose is of which frame: give poses with stamps (TUM), or one for each frame; if row n, from 0, is the "
+            "pose of the frame of that number, --match number"
+        )
     rows_for_stamps = len(trajectory) == len(frames) and np.array_equal(
         trajectory.stamps_s, np.arange(len(frames), dtype=float)
     )
