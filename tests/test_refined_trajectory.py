@@ -186,6 +186,16 @@ def test_poses_without_stamps_for_another_number_of_frames_are_matched_by_reques
     assert match_poses(rows, numbered([0.0, 1.0, 2.0, 3.0]), "auto", 0.1, "x").how == "row"
 
 
+def test_poses_have_a_frame_where_they_lie_among_the_frames() -> None:
+    """Frames 0.2 s apart with a hole; poses before, between, half a frame after the end, in the hole, and later."""
+    stamps = np.array([-0.15, 0.05, 0.31, 0.75, 0.8, 2.0, 3.05, 3.2, 3.3, 4.0])
+    trajectory = Trajectory(stamps, np.broadcast_to(np.eye(4), (len(stamps), 4, 4)))
+    frames = numbered([-2.0, 0.0, 0.2, 0.4, 0.6, 2.8, 3.0, 3.2])
+    matched = match_poses(trajectory, frames[1:], "auto", 0.1, "x")
+    assert matched.has_frame(0.1).tolist() == [False, True, True, True, True, False, True, True, True, False]
+    assert matched.outside() == 0 and match_poses(trajectory, frames, "auto", 0.1, "x").outside() == 1
+
+
 FILES = {
     "kept.txt": (TumRewriter, "# mine\n1.50 0 0 0 0 0 0 1 # end\n\n2.50\t1 0 0 0 0 0 1\n"),
     "kept.kitti": (KittiRewriter, "1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 0 0 0 1 0\n"),

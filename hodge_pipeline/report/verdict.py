@@ -47,6 +47,8 @@ REASONS = {
     "path loose": "the scans tell little of how far the scanner went",
     "reader's doubt": "the camera is assumed and images do not confirm it",
     "path scaled": "the path is of another size than the one given",
+    "mostly untested": "most of the poses given have no frame",
+    "frames outside": "most frames lie outside the time of the poses given",
     "depth unit": "depth is probably not in metres",
     "focal length": "images contradict the camera's focal length",
     "millimetres": "its unit looks like the millimetre",

@@ -13,7 +13,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.scene import given_poses
 from hodge_pipeline.sources.inspect import guess_reader, guesses
-from hodge_pipeline.types import Floats, Frame, Source, Trajectory, number_of
+from hodge_pipeline.types import Bools, Floats, Frame, Source, Trajectory, number_of
 from hodge_pipeline.types.text import counted
 
 Match: TypeAlias = Literal["auto", "stamp", "number", "row"]
@@ -54,6 +54,28 @@ class Matched:
     pose_times: Floats
     world_from_cam: Floats
     how: str
+
+    @property
+    def spacing(self) -> float:
+        """The usual time from frame to frame; 0 of a single one."""
+        return float(np.median(np.diff(np.sort(self.frame_times)))) if len(self.frame_times) > 1 else 0.0
+
+    def has_frame(self, max_gap_s: float) -> Bools:
+        """Which poses (P,) lie among the frames: none more than half a frame before the first or after the last, or
+        farther from the nearest one than frames usually are from each other, and than `max_gap_s` where it is time.
+        """
+        times, spacing = np.sort(self.frame_times), self.spacing
+        after = np.clip(np.searchsorted(times, self.pose_times), 1, max(len(times) - 1, 1))
+        after = np.minimum(after, len(times) - 1)
+        nearest = np.minimum(np.abs(self.pose_times - times[after - 1]), np.abs(self.pose_times - times[after]))
+        farthest = max(spacing, max_gap_s if self.how == "stamp" else 0.0)
+        inside = (self.pose_times >= times[0] - spacing / 2) & (self.pose_times <= times[-1] + spacing / 2)
+        return np.asarray(inside & (nearest <= farthest))
+
+    def outside(self) -> int:
+        """How many frames without a pose lie before the first pose or after the last one."""
+        missing = self.frame_times[~se3.has_pose(self.world_from_cam)]
+        return int(((missing < self.pose_times.min()) | (missing > self.pose_times.max())).sum())
 
 
 def own_poses(source: Source) -> Matched:
