@@ -91,6 +91,17 @@ def test_poses_of_other_frames_refine_nothing(frames: tuple[Frame, ...]) -> None
     assert decision.outcome == "nothing" and "only 2 of 12 key frames" in decision.reason
 
 
+def test_poses_of_opengls_camera_are_named_and_given_back(frames: tuple[Frame, ...]) -> None:
+    """They were rewritten into poses of our camera, as better ones."""
+    given = drifted(frames)[0] @ np.diag([1.0, -1.0, -1.0, 1.0])
+    found = hodge_pipeline.refine_trajectory(given, frames, overrides=SMALL)
+    assert found.decision.outcome == "convention" and found.decision.exit_code == 3 and found.poses is given
+    assert "OpenGL" in found.decision.reason and found.report.refinement is not None
+    assert found.report.refinement.headline == "The poses given look to be of another convention: they are given back"
+    forced = hodge_pipeline.refine_trajectory(given, frames, overrides=SMALL, force=True)
+    assert forced.decision.outcome == "forced" and "OpenGL" in forced.decision.reason
+
+
 @pytest.mark.parametrize("shape", [(3, 4, 4), (12, 3, 4)])
 def test_poses_that_are_not_one_for_each_frame_are_refused(frames: tuple[Frame, ...], shape: tuple[int, ...]) -> None:
     with pytest.raises(SourceError, match="one 4x4 matrix for each frame"):

@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 
 from hodge_pipeline.evaluation.difference import Better, alike, sign_of
 
-Outcome: TypeAlias = Literal["refined", "optimal", "worse", "forced", "nothing"]
+Outcome: TypeAlias = Literal["refined", "optimal", "worse", "forced", "convention", "nothing"]
 
 
 @dataclass(frozen=True)
@@ -86,6 +86,8 @@ class Decision:
       its own uncertainty: the input is given back;
     - `worse`: the result fails a measure of its own: the input is given back, and the exit code is 3;
     - `forced`: as `worse`, but the result is written all the same;
+    - `convention`: the input explains what was registered only if it is read otherwise: it is given back, and the exit
+      code is 3;
     - `nothing`: no measurement related the poses: nothing is written but the report, and the exit code is 3.
     """
 
@@ -99,12 +101,12 @@ class Decision:
     @property
     def keeps_input(self) -> bool:
         """Whether the input is given back, byte for byte."""
-        return self.outcome in ("optimal", "worse", "nothing")
+        return self.outcome in ("optimal", "worse", "convention", "nothing")
 
     @property
     def exit_code(self) -> int:
         """3 where the result failed its own checks, else 0."""
-        return 3 if self.outcome in ("worse", "nothing") else 0
+        return 3 if self.outcome in ("worse", "convention", "nothing") else 0
 
 
 def decide(measures: Sequence[Measure], change: Change | None = None, *, force: bool = False) -> Decision:

@@ -16,6 +16,7 @@ from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.pairs.held_out import held_out_pairs
+from hodge_pipeline.refine.conventions import explained
 from hodge_pipeline.refine.guard import Decision, Measure, decide
 from hodge_pipeline.refine.image_steps import MOST_STEPS, step_errors
 from hodge_pipeline.refine.uncertainty import change, mean_chi2
@@ -80,6 +81,9 @@ def finish(work: Work, folder: Path, rounds: Sequence[Round]) -> Refined:
 def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tuple[Decision, Floats]:
     """The decision, and the poses (K, 4, 4) of the key frames that it is on."""
     last, before = rounds[-1], key_frames.world_from_key
+    convention = _convention(work, last, before)
+    if convention and not work.recipe.guard.force:
+        return Decision("convention", convention), before
     nothing = _nothing(last)
     if nothing or last.solution is None:
         return Decision("nothing", nothing), before
@@ -88,6 +92,8 @@ def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
     measures.append(chi2_measure(*chi2))
     moved = change(last.graph, replace(last.solution, world_from_cam=after), before)
     decision = decide(measures, moved, force=work.recipe.guard.force)
+    if convention:
+        return Decision("forced", convention, decision.measures, moved), after
     if decision.outcome == "refined":  # by clouds, which a sensor may warp alike in every frame
         measures += [*_images(work, key_frames, after), *_size(work, key_frames, after), *_settled(work, rounds)]
         decision = decide(measures, moved, force=work.recipe.guard.force)
@@ -108,6 +114,17 @@ def _tell_untested(work: Work, decision: Decision, after: Floats) -> None:
         told += f", and moved as the nearest frame, by up to {length(moved_m[without].max())}"
         told += f", those with a frame by up to {length(moved_m[~without].max())}"
     work.steps.note(Note("mostly untested" if 2 * count > len(without) else "untested", count, told))
+
+
+def _convention(work: Work, last: Round, before: Floats) -> str:
+    """What is wrong with how the given poses were read, by the edges used; empty where nothing is known to be."""
+    if last.solution is None:
+        return ""
+    used, graph = last.solution.weights > 0, last.graph
+    found = explained(before, graph.edges[used], graph.i_from_j[used], se3.ARM_M * float(work.recipe.scale))
+    if found.is_unlike and not found.wrong:
+        work.steps.note(Note("given unlike", detail=f"{found.missed:.2f}"))
+    return found.wrong
 
 
 def _nothing(last: Round) -> str:
