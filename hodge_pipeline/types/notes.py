@@ -50,7 +50,7 @@ DOUBTS = {
     "path scaled": "The refined path is {detail} times as large as the one given: depth and the given poses are of "
     "two scales, or depth is warped, and nothing here tells which is right.",
     "given unlike": "The poses given miss {detail} of the registered motion (median), more than still ones would, and "
-    "no other convention explains them: are they of this camera, and of these frames?",
+    "no other convention explains them: are they of this camera, of these frames, and on their clock?",
     "mostly untested": "{count} of {detail}.",
     "frames outside": "{count} of {detail} frames are from before the first given pose or after the last one: are they "
     "of another clock, or another path?",
