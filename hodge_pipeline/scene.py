@@ -164,13 +164,15 @@ class Closed:
 class GivenFile:
     """A file of given poses, what it holds, and the moments (P,) of its poses on the clock of `KeyFrames.times`.
 
-    `true_world_from_cam (P, 4, 4)` is the truth nearest to each pose, NaN where there is none.
+    `true_world_from_cam (P, 4, 4)` is the truth nearest to each pose, NaN where there is none; `has_frame (P,)`: which
+    poses lie among the frames.
     """
 
     path: Path
     trajectory: Trajectory
     pose_times: Floats
     true_world_from_cam: Floats
+    has_frame: Bools
 
     def expand(self, key_frames: KeyFrames, world_from_key: Floats) -> Floats:
         """The poses (P, 4, 4) of the file, corrected as the key frames (K, 4, 4) were."""

@@ -55,6 +55,14 @@ def test_odometry_moved_to_the_optical_frame(tmp_path: Path) -> None:
     assert "1 of 4 frames have no pose within 0.2 s of their stamp" in source.notes
 
 
+def test_odometry_on_another_clock_is_asked_about(tmp_path: Path) -> None:
+    log = depth_log(some_images(2))
+    for row, pose in enumerate(some_poses(4)):
+        log.add("/odom", "nav_msgs/msg/Odometry", odometry(7300 + row / 10, pose, child=OPTICAL), CDR)
+    notes = McapReader().open(log.write(tmp_path / "log.mcap")).notes
+    assert "2 of 2 frames have no pose within 0.2 s of their stamp: are they on another clock?" in notes
+
+
 def test_odometry_of_a_body_that_nothing_links_to_the_camera(tmp_path: Path) -> None:
     log = depth_log(some_images(2))
     for row, pose in enumerate(some_poses(2)):

@@ -12,6 +12,7 @@ from hodge_pipeline.refine import verdict
 from hodge_pipeline.refine.guard import Measure, PoseChange, decide
 from hodge_pipeline.refine.verdict import chi2_measure, first_as_good, spread_corrections
 from hodge_pipeline.scene import KeyFrames
+from hodge_pipeline.types.notes import Note
 
 BETTER = Measure("held-out distance", 0.010, 0.009)
 WORSE = Measure("held-out score", 0.90, 0.88, better="higher")
@@ -123,3 +124,39 @@ def test_the_help_sends_a_graph_file_to_solve():
 def test_a_change_is_told_in_millimetres_and_degrees():
     told = str(PoseChange(0.0125, 0.25, 0.004, 0.5))
     assert told == "poses moved by 12.5 mm and 0.25° (RMS), known to 4 mm and 0.5°"
+
+
+def sized(before: np.ndarray, after: np.ndarray, off_images_m: np.ndarray, monkeypatch: pytest.MonkeyPatch):
+    """The measures of a path's size, and the notes, where images lie off the steps by this (2,)."""
+    notes: list[Note] = []
+    steps = SimpleNamespace(note=lambda *more: notes.extend(more))
+    frames = [SimpleNamespace(frame_id=row) for row in range(len(before))]
+    work = SimpleNamespace(
+        recipe=SimpleNamespace(scale=1.0), steps=steps, scene=SimpleNamespace(source=SimpleNamespace(frames=frames))
+    )
+    rows, zeros, ones = np.arange(len(before)), np.zeros(len(before), np.int64), np.ones(len(before), bool)
+    keys = KeyFrames(rows, before, before, zeros, rows / 30, ones, rows / 30, zeros, rows)
+    monkeypatch.setattr(
+        verdict, "_off_images_m", lambda work, firsts, *poses: np.tile(off_images_m[:, None], len(firsts))
+    )
+    return verdict._size(work, keys, after), notes
+
+
+def test_a_jump_of_the_given_path_is_no_other_scale(monkeypatch: pytest.MonkeyPatch):
+    """From 5 to 6 one metre too long: the refined path is less than half as large, its other steps are as long."""
+    true = se3.from_parts(np.broadcast_to(np.eye(3), (12, 3, 3)), np.outer(np.arange(12), [0.05, 0, 0]))
+    jumped = true.copy()
+    jumped[6:, 0, 3] += 1.0
+    nothing = np.full(2, np.nan)
+    measures, notes = sized(jumped, true, nothing, monkeypatch)
+    assert not measures and [note.kind for note in notes] == ["given jumps"]
+    assert "from frame 5 to 6 by 1.05 m, not 5 cm" in str(notes[0])
+    twice = jumped.copy()
+    twice[9:, 0, 3] += 2.0
+    measures, notes = sized(twice, true, nothing, monkeypatch)
+    assert not measures and "at 2 steps (from frame 8 to 9 by 2.05 m" in str(notes[0])
+    for before, after, images in ((true, jumped, nothing), (jumped, true, np.array([0.0, 1.0]))):
+        measures, notes = sized(before, after, images, monkeypatch)
+        assert measures and notes[0].kind == "path scaled", "a jump of the refined path, or one that images show"
+    measures, notes = sized(se3.rescaled(true, 1.3), true, nothing, monkeypatch)
+    assert measures and notes[0].kind == "path scaled" and notes[0].detail == "0.769"

@@ -224,6 +224,27 @@ def larger(trajectory: Trajectory, factor: float) -> Trajectory:
     return Trajectory(trajectory.stamps_s, poses)
 
 
+def test_given_poses_that_no_frame_tests_are_counted(sequence: Path, drifted: Trajectory, tmp_path: Path) -> None:
+    """Two poses a second before the frames; then stamps so late that most frames come before the first pose."""
+    early = Trajectory(
+        np.r_[drifted.stamps_s[0] - [1.0, 0.9], drifted.stamps_s],
+        np.concatenate([drifted.world_from_cam[:1]] * 2 + [drifted.world_from_cam]),
+    )
+    late = Trajectory(drifted.stamps_s + drifted.stamps_s[12] - drifted.stamps_s[0], drifted.world_from_cam)
+    notes, headlines = [], []
+    for name, given in (("early", early), ("late", late)):
+        write_tum(tmp_path / f"{name}.txt", given)
+        refine(tmp_path / f"{name}.txt", sequence, tmp_path / name)
+        report = json.loads((tmp_path / name / "report.json").read_text())
+        notes.append({note["kind"]: note["text"] for note in report["notes"]})
+        headlines.append(report["verdict"]["sentence"])
+    told = "2 of 18 given poses have no frame: not tested, and moved as the nearest frame, by up to"
+    assert notes[0]["untested"].startswith(told) and headlines[0].startswith("Better than")
+    assert notes[1]["mostly untested"].startswith("12 of 16 given poses have no frame")
+    assert notes[1]["frames outside"].startswith("12 of 16 frames are from before the first given pose")
+    assert headlines[1].startswith("In doubt, since most frames lie outside the time of the poses given and most of")
+
+
 def test_all_edges_rejected_leaves_the_report_alone(
     sequence: Path,
     drifted: Trajectory,

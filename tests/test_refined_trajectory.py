@@ -91,6 +91,17 @@ def test_poses_of_other_frames_refine_nothing(frames: tuple[Frame, ...]) -> None
     assert decision.outcome == "nothing" and "only 2 of 12 key frames" in decision.reason
 
 
+def test_poses_of_opengls_camera_are_named_and_given_back(frames: tuple[Frame, ...]) -> None:
+    """They were rewritten into poses of our camera, as better ones."""
+    given = drifted(frames)[0] @ np.diag([1.0, -1.0, -1.0, 1.0])
+    found = hodge_pipeline.refine_trajectory(given, frames, overrides=SMALL)
+    assert found.decision.outcome == "convention" and found.decision.exit_code == 3 and found.poses is given
+    assert "OpenGL" in found.decision.reason and found.report.refinement is not None
+    assert found.report.refinement.headline == "The poses given look to be of another convention: they are given back"
+    forced = hodge_pipeline.refine_trajectory(given, frames, overrides=SMALL, force=True)
+    assert forced.decision.outcome == "forced" and "OpenGL" in forced.decision.reason
+
+
 @pytest.mark.parametrize("shape", [(3, 4, 4), (12, 3, 4)])
 def test_poses_that_are_not_one_for_each_frame_are_refused(frames: tuple[Frame, ...], shape: tuple[int, ...]) -> None:
     with pytest.raises(SourceError, match="one 4x4 matrix for each frame"):
@@ -172,6 +183,28 @@ def test_poses_find_their_frames_by_stamp_number_or_row() -> None:
         match_poses(clock, numbered([70.0, 80.0, 90.0]), "auto", 0.1, "x")
     with pytest.raises(SourceError, match="by row"):
         match_poses(clock, numbered([10.0, 11.0]), "row", 0.1, "x")
+
+
+def test_poses_without_stamps_for_another_number_of_frames_are_matched_by_request_alone(tmp_path: Path) -> None:
+    """Four rows of KITTI for three frames went to the frames of their row numbers."""
+    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 4)
+    rows = guess_reader(tmp_path / "poses.txt").open(tmp_path / "poses.txt").trajectory
+    assert rows is not None
+    frames = numbered([0.0, 1.0, 2.0])
+    with pytest.raises(SourceError, match="4 poses without stamps for 3 frames: .*--match number"):
+        match_poses(rows, frames, "auto", 0.1, "x")
+    assert match_poses(rows, frames, "number", 0.1, "x").how == "number"
+    assert match_poses(rows, numbered([0.0, 1.0, 2.0, 3.0]), "auto", 0.1, "x").how == "row"
+
+
+def test_poses_have_a_frame_where_they_lie_among_the_frames() -> None:
+    """Frames 0.2 s apart with a hole; poses before, between, half a frame after the end, in the hole, and later."""
+    stamps = np.array([-0.15, 0.05, 0.31, 0.75, 0.8, 2.0, 3.05, 3.2, 3.3, 4.0])
+    trajectory = Trajectory(stamps, np.broadcast_to(np.eye(4), (len(stamps), 4, 4)))
+    frames = numbered([-2.0, 0.0, 0.2, 0.4, 0.6, 2.8, 3.0, 3.2])
+    matched = match_poses(trajectory, frames[1:], "auto", 0.1, "x")
+    assert matched.has_frame(0.1).tolist() == [False, True, True, True, True, False, True, True, True, False]
+    assert matched.outside() == 0 and match_poses(trajectory, frames, "auto", 0.1, "x").outside() == 1
 
 
 FILES = {

@@ -87,7 +87,7 @@ class NerfstudioReader:
                 f"(w, h, fl_x): {listed(lost)}"
             )
         poses = np.array([frame.world_from_cam for frame in frames])
-        trajectory = Trajectory(np.arange(len(frames), dtype=float), poses)
+        trajectory = Trajectory(np.arange(len(frames), dtype=float), poses, has_stamps=False)
         name = file.parent.resolve().name if path.is_dir() else file.stem
         return Source(name, path, frames[:: self.every], trajectory, notes=tuple(notes), files=(file,))
 

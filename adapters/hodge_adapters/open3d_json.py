@@ -135,7 +135,7 @@ def _open_graph(path: Path, content: dict[str, Any]) -> Source:
     rows = np.array(ends, np.int64).reshape(-1, 2)
     graph = ViewGraph.from_edges(np.arange(len(nodes)), rows, i_from_j, ours)
     graph = replace(graph, source=np.array(names, np.str_).reshape(-1))
-    trajectory = Trajectory(np.arange(len(nodes), dtype=float), poses)
+    trajectory = Trajectory(np.arange(len(nodes), dtype=float), poses, has_stamps=False)
     return Source(path.stem, path, trajectory=trajectory, graph=graph, files=(path,), of_cameras=True)
 
 
@@ -148,7 +148,7 @@ def _open_trajectory(path: Path, content: dict[str, Any]) -> Source:
     if not frames:
         raise SourceError(f"{path}: a trajectory without cameras: give one that has some")
     stamps = np.arange(len(frames), dtype=float)
-    trajectory = Trajectory(stamps, np.array([frame.world_from_cam for frame in frames]))
+    trajectory = Trajectory(stamps, np.array([frame.world_from_cam for frame in frames]), has_stamps=False)
     return Source(path.stem, path, tuple(frames), trajectory, files=(path,))
 
 

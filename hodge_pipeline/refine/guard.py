@@ -10,7 +10,7 @@ from hodge_pipeline.evaluation.difference import Better, alike, sign_of
 
 SCORE_TOLERANCE = 0.002
 """Least tolerance of a score exp(−d/σ), σ = 69 mm: what 0.14 mm of distance between clouds make."""
-Outcome: TypeAlias = Literal["refined", "optimal", "worse", "forced", "nothing"]
+Outcome: TypeAlias = Literal["refined", "optimal", "worse", "forced", "convention", "nothing"]
 
 
 @dataclass(frozen=True)
@@ -90,6 +90,8 @@ class Decision:
       than its uncertainty;
     - `worse`: the input is given back, since the result fails a measure; exit code 3;
     - `forced`: as `worse`, but the result is written;
+    - `convention`: the input is given back, since it explains what was registered only if it is read otherwise; exit
+      code 3;
     - `nothing`: only the report is written, since no measurement relates the poses; exit code 3.
     """
 
@@ -103,12 +105,12 @@ class Decision:
     @property
     def keeps_input(self) -> bool:
         """Whether the input is given back, byte for byte."""
-        return self.outcome in ("optimal", "worse", "nothing")
+        return self.outcome in ("optimal", "worse", "convention", "nothing")
 
     @property
     def exit_code(self) -> int:
         """3 where the result failed its own checks, else 0."""
-        return 3 if self.outcome in ("worse", "nothing") else 0
+        return 3 if self.outcome in ("worse", "convention", "nothing") else 0
 
 
 def decide(measures: Sequence[Measure], change: PoseChange | None = None, *, force: bool = False) -> Decision:

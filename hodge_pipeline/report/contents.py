@@ -164,8 +164,9 @@ class StageRow:
 
 @dataclass(frozen=True)
 class RefinementSummary:
-    """What became of a refinement: `outcome` is refined, optimal, worse or forced; why; what it rests on; and why even
-    what is kept may be wrong, if anything says so. Of a model: what each candidate costs, and which row is `kept`.
+    """What became of a refinement: `outcome` is refined, optimal, worse, forced, convention or nothing; why; what it
+    rests on; and why even what is kept may be wrong, if anything says so. Of a model: what each candidate costs, and
+    which row is `kept`.
     """
 
     outcome: str

@@ -30,6 +30,7 @@ HEADLINES = {
     "optimal": "No significant improvement: the poses given are given back",
     "worse": "Worse than the poses given: those are given back",
     "forced": "Worse than the poses given, written all the same",
+    "convention": "The poses given look to be of another convention: they are given back",
     "nothing": "Nothing could be refined: no poses are written",
 }
 

@@ -33,7 +33,7 @@ NO_MEASURE = "nothing was there to compare the poses by, before and after."
 
 REFINEMENTS: dict[str, Outcome] = {
     "refined": "improved", "solved": "improved", "optimal": "unchanged", "worse": "worse", "forced": "worse",
-    "nothing": "not measured",
+    "convention": "not measured", "nothing": "not measured",
 }  # fmt: skip
 DOUBTS = {
     "images missing": "{count} of {detail} are missing",
@@ -47,6 +47,9 @@ REASONS = {
     "path loose": "the scans tell little of how far the scanner went",
     "reader's doubt": "the camera is assumed and images do not confirm it",
     "path scaled": "the path is of another size than the one given",
+    "given unlike": "still poses would explain the registered motion better than those given",
+    "mostly untested": "most of the poses given have no frame",
+    "frames outside": "most frames lie outside the time of the poses given",
     "depth unit": "depth is probably not in metres",
     "focal length": "images contradict the camera's focal length",
     "millimetres": "its unit looks like the millimetre",

@@ -132,7 +132,11 @@ class GivenStart:
         true = _true_at(matched.pose_times, matched, source)
         if has_truth(source) and not np.isfinite(true).any():
             steps.note(Note("no truth near", detail=str(self.path)))
-        return matched, GivenFile(self.path, trajectory, matched.pose_times, true)
+        outside = matched.outside()
+        if 2 * outside > len(source.frames):
+            steps.note(Note("frames outside", outside, str(len(source.frames))))
+        has_frame = matched.has_frame(self.max_gap_s)
+        return matched, GivenFile(self.path, trajectory, matched.pose_times, true, has_frame)
 
     def _bridged(
         self, source: Source, matched: Matched, clouds: CloudOptions, steps: Steps, workers: Workers

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -13,7 +13,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.scene import given_poses
 from hodge_pipeline.sources.inspect import guess_reader, guesses
-from hodge_pipeline.types import Floats, Frame, Source, Trajectory, number_of
+from hodge_pipeline.types import Bools, Floats, Frame, Source, Trajectory, number_of
 from hodge_pipeline.types.text import counted
 
 Match: TypeAlias = Literal["auto", "stamp", "number", "row"]
@@ -55,6 +55,28 @@ class Matched:
     world_from_cam: Floats
     how: str
 
+    @property
+    def spacing(self) -> float:
+        """The usual time from frame to frame; 0 of a single one."""
+        return float(np.median(np.diff(np.sort(self.frame_times)))) if len(self.frame_times) > 1 else 0.0
+
+    def has_frame(self, max_gap_s: float) -> Bools:
+        """Which poses (P,) lie among the frames: none more than half a frame before the first or after the last, or
+        farther from the nearest one than frames usually are from each other, and than `max_gap_s` where it is time.
+        """
+        times, spacing = np.sort(self.frame_times), self.spacing
+        after = np.clip(np.searchsorted(times, self.pose_times), 1, max(len(times) - 1, 1))
+        after = np.minimum(after, len(times) - 1)
+        nearest = np.minimum(np.abs(self.pose_times - times[after - 1]), np.abs(self.pose_times - times[after]))
+        farthest = max(spacing, max_gap_s if self.how == "stamp" else 0.0)
+        inside = (self.pose_times >= times[0] - spacing / 2) & (self.pose_times <= times[-1] + spacing / 2)
+        return np.asarray(inside & (nearest <= farthest))
+
+    def outside(self) -> int:
+        """How many frames without a pose lie before the first pose or after the last one."""
+        missing = self.frame_times[~se3.has_pose(self.world_from_cam)]
+        return int(((missing < self.pose_times.min()) | (missing > self.pose_times.max())).sum())
+
 
 def own_poses(source: Source) -> Matched:
     """The frames' own poses."""
@@ -68,8 +90,11 @@ def match_poses(trajectory: Trajectory, frames: Sequence[Frame], match: Match, m
 
     Raises `SourceError` where they have nothing in common, or `match` asks for what is not there.
     """
+    rows = len(trajectory)
     usable = se3.has_pose(trajectory.world_from_cam) & np.isfinite(trajectory.stamps_s)
-    trajectory = Trajectory(trajectory.stamps_s[usable], trajectory.world_from_cam[usable])
+    trajectory = replace(
+        trajectory, stamps_s=trajectory.stamps_s[usable], world_from_cam=trajectory.world_from_cam[usable]
+    )
     if not len(trajectory):
         raise SourceError(f"{where}: no pose in it: give a trajectory")
     if match != "auto":
@@ -77,6 +102,12 @@ def match_poses(trajectory: Trajectory, frames: Sequence[Frame], match: Match, m
         if matched is None or not np.isfinite(matched.world_from_cam).any():
             raise SourceError(f"{where}: no frame finds a pose by {match}: {_ranges(trajectory, frames)}")
         return matched
+    if not trajectory.has_stamps and rows != len(frames):
+        raise SourceError(
+            f"{where}: {counted(rows, 'pose')} without stamps for {counted(len(frames), 'frame')}: nothing tells which "
+            "pose is of which frame: give poses with stamps (TUM), or one for each frame; if row n, from 0, is the "
+            "pose of the frame of that number, --match number"
+        )
     rows_for_stamps = len(trajectory) == len(frames) and np.array_equal(
         trajectory.stamps_s, np.arange(len(frames), dtype=float)
     )

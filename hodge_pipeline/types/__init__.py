@@ -111,10 +111,14 @@ def number_of(frame: Frame) -> int | str:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses in time: `stamps_s (N,)` seconds, ascending; `world_from_cam (N, 4, 4)`."""
+    """Poses in time: `stamps_s (N,)` seconds, ascending; `world_from_cam (N, 4, 4)`.
+
+    `has_stamps`: False where its format has neither stamps nor frame numbers; `stamps_s` then number the poses.
+    """
 
     stamps_s: Floats
     world_from_cam: Floats
+    has_stamps: bool = True
 
     def __len__(self) -> int:
         return len(self.stamps_s)

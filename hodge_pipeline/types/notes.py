@@ -47,6 +47,11 @@ DOUBTS = {
     "the camera in every direction, and no other edge tests the step.",
     "path scaled": "The refined path is {detail} times as large as the one given: depth and the given poses are of "
     "two scales, or depth is warped, and nothing here tells which is right.",
+    "given unlike": "The poses given miss {detail} of the registered motion (median), more than still ones would, and "
+    "no other convention explains them: are they of this camera, of these frames, and on their clock?",
+    "mostly untested": "{count} of {detail}.",
+    "frames outside": "{count} of {detail} frames are from before the first given pose or after the last one: are they "
+    "of another clock, or another path?",
     "path loose": "The length of the path is in doubt: {count} of {detail} sweeps {count:tells|tell} little of how "
     "far the scanner went, as on a bare field, and it goes on as before there. Known positions (positions.path) would "
     "hold it.",
@@ -103,6 +108,9 @@ LOOKS = {
     "nothing held out": "no overlapping pair was left to judge the result by: only the edges' own chi2 does",
     "rougher": "the steps from key frame to key frame are rougher than those given: from those that images show they "
     "are {detail}",
+    "untested": "{count} of {detail}",
+    "given jumps": "The path given jumps at {count} {count:step|steps} ({detail}): the refined one has no such "
+    "{count:step|steps}.",
     "other format": "poses are not written back into {detail}: refined.tum holds them",
     "alone": "{count} of {detail} frames {count:has|have} no edge at all: {count:it keeps the pose it|they keep the "
     "pose they} started with.",

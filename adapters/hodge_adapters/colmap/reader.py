@@ -153,7 +153,7 @@ class ColmapReader:
             name=path.resolve().name,
             path=path,
             frames=frames[:: self.every],
-            trajectory=Trajectory(np.arange(len(poses), dtype=float), poses),
+            trajectory=Trajectory(np.arange(len(poses), dtype=float), poses, has_stamps=False),
             graph=None if graph is None else scaled_graph(graph, scale),
             notes=tuple(notes),
             files=files,

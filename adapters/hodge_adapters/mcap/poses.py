@@ -43,7 +43,9 @@ def find_poses(
         poses = _from_transforms(recording, camera_frame, stamps_s, options, notes)
     without = int(np.isnan(poses.of_frames[:, 0, 0]).sum())
     if without and poses.trajectory is not None and poses.linked:
-        notes.append(f"{without} of {len(stamps_s)} frames have no pose within {options.max_gap_s:g} s of their stamp")
+        hint = ": are they on another clock?" if without == len(stamps_s) else ""
+        limit = f"{options.max_gap_s:g} s of their stamp"
+        notes.append(f"{without} of {len(stamps_s)} frames have no pose within {limit}{hint}")
     return poses
 
 

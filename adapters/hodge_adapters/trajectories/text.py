@@ -130,7 +130,8 @@ def read_kitti(path: Path, times: Path | None = None) -> Trajectory:
     if len(wrong):
         raise SourceError(f"{path}:{rows[wrong[0]].line}: not a rigid motion: is this a KITTI pose file?")
     poses[:, :3, :3] = se3.project_to_so3(poses[:, :3, :3])
-    return Trajectory(_read_times(times, len(rows)) if times else np.arange(len(rows), dtype=float), poses)
+    stamps_s = _read_times(times, len(rows)) if times else np.arange(len(rows), dtype=float)
+    return Trajectory(stamps_s, poses, has_stamps=times is not None)
 
 
 def write_kitti(path: Path, trajectory: Trajectory) -> None:
