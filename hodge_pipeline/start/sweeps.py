@@ -25,7 +25,7 @@ from hodge_pipeline.registration.clouds import (
 from hodge_pipeline.registration.gaps import told_gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, OdometryOptions, chained
 from hodge_pipeline.registration.pairs import register_pairs
-from hodge_pipeline.registration.scan_to_map import ScanToMap, first_velocity
+from hodge_pipeline.registration.scan_to_map import ScanToMap, first_velocity, followed
 from hodge_pipeline.registration.sweeps import deskewed_frame, first_after_s, velocities
 from hodge_pipeline.scene import (
     KeyFrames,
@@ -54,6 +54,7 @@ REACH_QUANTILE = 0.99
 WARM_UP = 20
 """Sweeps that the first velocity is found on."""
 LEFT_OUT = "the sweep is left out"
+STRANGE = "it fits nothing around it, and the sweeps before and after it fit each other: is it of another place?"
 MOST_LOOSE = 0.5
 """Share of sweeps that tell little of how far the scanner went, above which the whole path is in doubt."""
 LOOKS = 9
@@ -133,7 +134,8 @@ def follow(
         raise SourceError(f"{source.path}: none of the {count} sweeps gave points in range; the first: {odd[0]}")
     step.note(*notes_of("clouds", shortened(odd)))
     if not found.all():
-        step.note(Note("sweeps left out", int((~found).sum()), next(one.why for one in odd if one.what == LEFT_OUT)))
+        first = next(one for one in odd if one.what == LEFT_OUT)
+        step.note(Note("sweeps left out", int((~found).sum()), f"{first.frame}: {first.why}"))
     if loose.any():
         kind = "path loose" if loose.sum() > MOST_LOOSE * found.sum() else "sweeps loose"
         step.note(Note(kind, int(loose.sum()), str(count)))
@@ -161,29 +163,39 @@ class _Followed(NamedTuple):
 def _follow_one(
     frames: list[Frame], stamps_s: Floats, clouds: CloudOptions, voxel_m: float | None, advance: Advance
 ) -> _Followed:
-    count, is_timed, followed, odd = len(frames), False, list[int](), list[Oddity]()
+    count, is_timed, rows, odd = len(frames), False, list[int](), list[Oddity]()
     poses, velocity, middle_s = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6)), np.zeros(count)
-    found, loose = np.zeros(count, bool), np.zeros(count, bool)
+    found, loose, original = np.zeros(count, bool), np.zeros(count, bool), np.arange(count)
     reach_m, usual_turn_s = _first_look(frames, clouds)
     times = _times(stamps_s, usual_turn_s)
     voxel = voxel_m or max(reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
     first = zip(times, _sweeps(frames[:WARM_UP], clouds, reach_m), strict=False)
     tracker = ScanToMap(voxel, first_velocity(voxel, [(at, one.cloud) for at, one in first if one.cloud]))
-    for row, sweep in enumerate(_sweeps(frames, clouds, reach_m)):
-        if sweep.cloud is not None:
-            tracker.follow(sweep.cloud, times[row])
-            loose[row], is_timed = tracker.is_loose, is_timed or tracker.turn_s > 0
-            middle_s[row] = tracker.turn_s / 2 + first_after_s(sweep.cloud, frames[row].stamp_s)
-            followed.append(row)
-        poses[row] = tracker.pose
-        found[row] = sweep.cloud is not None or sweep.is_copy
-        odd += [] if sweep.odd is None else [sweep.odd]
-        advance(1)
-    if followed:
-        last = np.maximum(np.searchsorted(followed, np.arange(count), side="right") - 1, 0)
-        velocity = velocities(poses[followed], times[followed])[last]
-        middle_s = middle_s[followed][last]
-        poses = poses @ se3.exp(-middle_s[:, None] * velocity)  # to the stamp
+
+    def read() -> Iterator[tuple[int, float, PointCloud]]:
+        latest = 0
+        for row, sweep in enumerate(_sweeps(frames, clouds, reach_m)):
+            odd.extend([] if sweep.odd is None else [sweep.odd])
+            original[row] = latest if sweep.is_copy else row
+            if sweep.cloud is not None:
+                latest = row
+                middle_s[row] = first_after_s(sweep.cloud, frames[row].stamp_s)
+                yield row, times[row], sweep.cloud
+            advance(1)
+
+    for row, placed in followed(tracker, read()):
+        if placed is None:
+            odd.append(Oddity(frames[row].frame_id, LEFT_OUT, STRANGE))
+            continue
+        poses[row], loose[row], is_timed = placed.pose, placed.is_loose, is_timed or placed.turn_s > 0
+        middle_s[row] += placed.turn_s / 2
+        rows.append(row)
+    if rows:
+        found[rows] = True
+        found = found[original]
+        last = np.maximum(np.searchsorted(rows, np.arange(count), side="right") - 1, 0)
+        velocity = velocities(poses[rows], times[rows])[last]
+        poses = poses[rows][last] @ se3.exp(-middle_s[rows][last][:, None] * velocity)  # to the stamp
     return _Followed(poses, velocity, found, loose, is_timed, reach_m, odd)
 
 
