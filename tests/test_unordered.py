@@ -18,7 +18,8 @@ from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
 from hodge_pipeline.registration.colour_evidence import hue_conflicts
 from hodge_pipeline.registration.global_evidence import DepthView
-from hodge_pipeline.stages import no_progress
+from hodge_pipeline.stages import Step, no_progress
+from hodge_pipeline.start.clouds import clouds as make_clouds
 from hodge_pipeline.start.unordered.folds import Pieces, contradictions, unfolded, within_parts
 from hodge_pipeline.start.unordered.hypotheses import (
     AMBIGUOUS,
@@ -34,8 +35,9 @@ from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.start.unordered.scan_checks import check_scans, unregistrable
 from hodge_pipeline.start.unordered.start import Frames, Start, _ambiguous_pairs, _none_joined, find_start
 from hodge_pipeline.start.unordered.tour import propose_along_tour, tour
-from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, PointCloud, ViewGraph
+from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, PointCloud, Source, ViewGraph
 from hodge_pipeline.types.edges import REJECTED, USED
+from hodge_pipeline.types.notes import Note
 from scan_data import write_e57
 from test_global_registration import furnished_corner
 
@@ -125,12 +127,23 @@ def test_a_blob_and_five_points_are_said_to_be_so() -> None:
     assert unregistrable(cloud(furnished_corner(0))) == ""
 
 
-def test_copies_and_other_units_are_noticed() -> None:
+def test_copies_are_noticed() -> None:
     corner = furnished_corner(0)
-    clouds = CloudSet.from_clouds([read(corner), read(corner), read(furnished_corner(1)), read(1000 * corner)])
-    notes = check_scans(clouds, np.array([7, 8, 9, 10]))
-    assert any("scan 8: holds the same points as scan 7" in note for note in notes)
-    assert any("scan 10: spans 2e+03 m" in note and "units_per_metre" in note for note in notes)
+    clouds = CloudSet.from_clouds([read(corner), read(corner), read(furnished_corner(1))])
+    assert any("scan 8: holds the same points as scan 7" in note for note in check_scans(clouds, np.array([7, 8, 9])))
+
+
+def test_a_scan_in_millimetres_is_named_though_few_of_its_points_are_in_range(tmp_path: Path) -> None:
+    corner = furnished_corner(0)
+    scans = [read(corner), read(furnished_corner(1)), read(1000 * corner)]
+    frames = [Frame(f"{row}.ply", float(row), read_points=partial(scans.__getitem__, row)) for row in range(3)]
+    said: list[Note] = []
+    step = Step(tmp_path, no_progress, lambda *notes: said.extend(notes))
+    source = Source("corners", tmp_path, tuple(frames))
+    with LocalExecutor(workers=0).open() as workers:
+        make_clouds(source, CloudOptions(max_range_m=20.0), workers=workers, step=step)
+    told = [str(note) for note in said if note.kind == "other units"]
+    assert len(told) == 1 and "2.ply: it seems to have other units" in told[0] and "units_per_metre" in told[0]
 
 
 def test_pieces_lie_beside_each_other() -> None:

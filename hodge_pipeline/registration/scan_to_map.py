@@ -52,8 +52,8 @@ MOST_DESKEWS, FARTHER = 3, 0.9
 
 
 class Step(NamedTuple):
-    """A sweep placed in the map, not yet part of it: `pose` at its middle, `time_s` at which it began, its velocity (6,)
-    with the covariance (3, 3) of the translation; the share of its points on the map, NaN where it could not be
+    """A sweep placed in the map, not yet part of it: `pose` at its middle, `time_s` at which it began, its velocity
+    (6,) with the covariance (3, 3) of the translation; the share of its points on the map, NaN where it could not be
     aligned; see `ScanToMap` for the others.
     """
 

@@ -61,6 +61,7 @@ DOUBTS = {
 """What puts the result in doubt."""
 LOOKS = {
     "option unknown": "{detail}; made by another version: it is left out of what is shown",
+    "other units": "{detail}",
     "not a video": "{count} frames are numbered, and nothing tells how many make a second: each is registered, "
     "and none tracked. Set start.whole_up_to=1 if they are a video",
     "tracking lost": "tracking was lost at {count} {count:frame|frames} ({detail}): {count:its pose is|their poses "
