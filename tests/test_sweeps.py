@@ -283,3 +283,15 @@ def test_a_scene_that_changes_is_followed() -> None:
     frames = [*street()[:12], *(changed(frame, mirrored) for frame in street()[12:])]
     found, said = followed(frames)
     assert found.found.all() and "left out" not in said
+
+
+def test_a_sweep_without_points_in_the_middle_hides_no_scanner_and_is_named() -> None:
+    for spoil, said in ((broken, "12.pcd cannot be read: cut off"), (nothing_of, "12.pcd has no points")):
+        frames, oddities = street().copy(), list[str]()
+        frames[COUNT // 2] = changed(frames[COUNT // 2], spoil)
+        assert "its points have times" in str(frame_facts(frames, oddities)["scanner"])
+        assert sum(said in oddity for oddity in oddities) == 1
+
+
+def nothing_of(cloud: PointCloud) -> PointCloud:
+    return PointCloud(cloud.points_in_cam[:0])

@@ -30,6 +30,7 @@ from hodge_pipeline.start.unordered.hypotheses import (
     allowed_hue_conflict,
     allowed_violation,
 )
+from hodge_pipeline.start.unordered.mirrored import mirrored_scans
 from hodge_pipeline.start.unordered.options import GlobalStart, HypothesisLimits
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.start.unordered.scan_checks import check_scans, unregistrable
@@ -344,3 +345,21 @@ def test_where_no_two_scans_are_joined_the_report_says_what_to_do(pose: Floats |
     (note,) = _none_joined(scene, edges, np.arange(3))
     assert note.kind == "none joined" and todo in note.detail
     assert _none_joined(scene, edges, np.array([0, 0, 1])) == ()
+
+
+@pytest.mark.parametrize("of_reflection, found", [(0.6, [2]), (0.12, [])], ids=["mirrored", "far off"])
+def test_a_scan_whose_reflection_fits_clearly_better_is_mirrored(
+    of_reflection: float, found: list[int], tmp_path: Path
+) -> None:
+    corner = furnished_corner(0)
+    clouds = CloudSet.from_clouds([read(corner)] * 4)
+    pairs = np.array([[0, 1], [0, 3], [1, 3], [0, 2], [2, 3]])
+    overlap = np.array([0.6, 0.5, 0.6, 0.15, 0.12])
+    edges = Edges.of(pairs).put(slice(None), status=USED, overlap=overlap, i_from_j=np.eye(4))
+
+    def match(alone: CloudSet, _folder: Path) -> Edges:
+        np.testing.assert_allclose(alone[0].points_in_cam, corner * [-1, 1, 1], atol=1e-6)
+        at = np.stack([np.zeros(2, int), [1, 2]], axis=1)
+        return Edges.of(at).put(slice(None), status=USED, overlap=np.full(2, of_reflection), i_from_j=np.eye(4))
+
+    assert mirrored_scans(clouds, edges, match, tmp_path).tolist() == found

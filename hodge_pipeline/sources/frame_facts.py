@@ -11,7 +11,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.depth_units import PLAUSIBLE_DEPTH_M, SAMPLED_FRAMES, doubts_of
-from hodge_pipeline.types import Bools, Camera, Floats, Floats32, Frame, Trajectory
+from hodge_pipeline.types import Bools, Camera, Floats, Floats32, Frame, PointCloud, Trajectory
 from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.text import UNKNOWN_UNIT, counted
 
@@ -25,6 +25,8 @@ FEWEST_SWEEPS, SWEEP_POINTS = 10, 300_000
 SECTORS, ALL_ROUND = 36, 0.9
 """Of ten degrees each; the share of them that holds points of a scanner that sees all round it."""
 MOSTLY_EMPTY = 0.9
+MOST_READ = 10
+"""Sweeps read, from the middle outward, for one with points."""
 
 
 def frame_facts(frames: Sequence[Frame], oddities: list[str], unit: str = METRES) -> dict[str, Any]:
@@ -53,7 +55,7 @@ def frame_facts(frames: Sequence[Frame], oddities: list[str], unit: str = METRES
     if 0 < without < len(frames) and not facts["frames with points"]:
         bare = [str(frame.frame_id) for frame in frames if frame.read_depth is None]
         oddities.append(f"{without} of {len(frames)} frames have no depth: {listed(bare)}")
-    return {**facts, **_depth_facts(frames, oddities), **_scanner_facts(frames)}
+    return {**facts, **_depth_facts(frames, oddities), **_scanner_facts(frames, oddities)}
 
 
 def _cameras(count_of: Counter[Camera]) -> list[str]:
@@ -71,14 +73,12 @@ def _cameras(count_of: Counter[Camera]) -> list[str]:
     ]
 
 
-def _scanner_facts(frames: Sequence[Frame]) -> dict[str, Any]:
-    """Whether the points look like those of a scanner that turns while it moves, by one frame in the middle."""
-    middle = frames[len(frames) // 2]
-    try:
-        cloud = middle.read_points() if middle.read_points else None
-    except (SourceError, OSError):
-        cloud = None
-    if cloud is None or not len(cloud) or len(frames) < FEWEST_SWEEPS:
+def _scanner_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]:
+    """Whether the points look like those of a scanner that turns while it moves, by the frame that is nearest to the
+    middle among those that can be read and have points.
+    """
+    cloud = _middle_cloud(frames, oddities) if len(frames) >= FEWEST_SWEEPS else None
+    if cloud is None:
         return {}
     if cloud.times_s is not None:
         return {"scanner": "turns while it moves: its points have times"}
@@ -86,6 +86,23 @@ def _scanner_facts(frames: Sequence[Frame]) -> dict[str, Any]:
     seen = np.count_nonzero(np.bincount(((turns + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS))
     sees_round = seen >= ALL_ROUND * SECTORS and len(cloud) <= SWEEP_POINTS
     return {"scanner": "sees all round"} if sees_round else {}
+
+
+def _middle_cloud(frames: Sequence[Frame], oddities: list[str]) -> PointCloud | None:
+    middle = len(frames) // 2
+    for row in sorted(range(len(frames)), key=lambda row: abs(row - middle))[:MOST_READ]:
+        read = frames[row].read_points
+        if read is None:
+            return None
+        try:
+            cloud = read()
+        except (SourceError, OSError) as error:
+            oddities.append(f"frame {frames[row].frame_id} cannot be read: {error}")
+            continue
+        if len(cloud):
+            return cloud
+        oddities.append(f"frame {frames[row].frame_id} has no points")
+    return None
 
 
 def trajectory_facts(trajectory: Trajectory, oddities: list[str]) -> dict[str, Any]:
