@@ -25,6 +25,10 @@ FEWEST_SWEEPS, SWEEP_POINTS = 10, 300_000
 SECTORS, ALL_ROUND = 36, 0.9
 """Of ten degrees each; the share of them that holds points of a scanner that sees all round it."""
 MOSTLY_EMPTY = 0.9
+ODDLY_LOST = 0.25
+"""Share of a scan's points that are no numbers beyond that of the median scan, from which it is named: organised scans
+of one sensor lose alike.
+"""
 MOST_READ = 10
 """Sweeps read, from the middle outward, for one with points."""
 
@@ -101,7 +105,8 @@ def _middle_cloud(frames: Sequence[Frame], oddities: list[str]) -> PointCloud | 
             continue
         if len(cloud):
             return cloud
-        oddities.append(f"frame {frames[row].frame_id} has no points")
+        if (empty := f"frame {frames[row].frame_id} has no points") not in oddities:
+            oddities.append(empty)
     return None
 
 
@@ -179,11 +184,12 @@ def _note_ids(frames: Sequence[Frame], oddities: list[str]) -> None:
 def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]:
     """Depth range and invalid share of a few frames, evenly over the sequence, and their images that cannot be read."""
     with_depth = [frame for frame in frames if frame.read_depth is not None or frame.read_points is not None]
-    depths, faults = [], []
+    depths, faults, lost_of = list[Floats32](), list[str](), dict[str, float]()
     for row in evenly(len(with_depth), SAMPLED_FRAMES):
         frame = with_depth[row]
         try:
-            depths.append(_depth(frame).ravel())
+            depth, lost = _depth(frame)
+            depths.append(depth.ravel())
         except (SourceError, OSError) as error:
             faults.append(str(error))
             continue
@@ -191,6 +197,13 @@ def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]
         share = float((depths[-1] <= 0).mean()) if depths[-1].size else 1.0
         if share > MOSTLY_EMPTY and frame.read_depth is not None:
             oddities.append(f"frame {frame.frame_id}: {share:.0%} of its pixels have no depth")
+        elif not depths[-1].size:
+            oddities.append(f"frame {frame.frame_id} has no points")
+        lost_of[str(frame.frame_id)] = lost
+    usual = float(np.median(list(lost_of.values()))) if lost_of else 0.0
+    for name, share in lost_of.items():
+        if share > usual + ODDLY_LOST:
+            oddities.append(f"frame {name}: {share:.0%} of its points are no numbers")
     values = np.concatenate(depths) if depths else np.zeros(0)
     valid = values[values > 0]
     median = float(np.median(valid)) if len(valid) else None
@@ -207,12 +220,16 @@ def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]
     }
 
 
-def _depth(frame: Frame) -> Floats32:
-    """The depth image, or the distances of a cloud's points, since a scanner sees all round."""
+def _depth(frame: Frame) -> tuple[Floats32, float]:
+    """The depth image, or the distances of a cloud's points, since a scanner sees all round; and the share of points
+    that are no numbers.
+    """
     if frame.read_depth is not None:
-        return frame.read_depth()
+        return frame.read_depth(), 0.0
     assert frame.read_points is not None
-    return np.asarray(np.linalg.norm(frame.read_points().points_in_cam, axis=1), np.float32)
+    cloud = frame.read_points()
+    distances = np.asarray(np.linalg.norm(cloud.points_in_cam, axis=1), np.float32)
+    return distances, cloud.no_numbers / max(len(cloud) + cloud.no_numbers, 1)
 
 
 def _colour_fault(frame: Frame) -> list[str]:
