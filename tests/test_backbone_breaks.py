@@ -9,6 +9,7 @@ import pytest
 from benchmarks.wrong_loops import simulated_cases
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
+from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.solvers.backbone.breaks import StepModel
 from hodge_pipeline.solvers.backbone.chain import make_chain
 from hodge_pipeline.solvers.backbone.inference import BY_CHANCE
@@ -112,6 +113,12 @@ def test_a_robot_that_was_carried_or_thought_that_it_stood_still_goes_on_where_l
         backbone = find_backbone(drove.graph)
         assert backbone is not None and backbone.chain.broken.sum() == 1
         assert drove.error_m(backbone.world_from_cam) < 0.5 * drove.error_m(drove.odometry())
+
+
+def test_where_odometry_notices_its_breaks_loops_call_no_step_wrong() -> None:
+    graph = broken(drive(loops=200), 90)
+    assert np.flatnonzero(diagnose(graph).verdict[:399] == "wrong").tolist() == [90]
+    assert diagnose(graph, DiagnosisOptions(trust="sequential", most_breaks=0)).kept[:399].all()
 
 
 def test_a_break_over_which_the_loops_then_are_of_one_corridor_is_none() -> None:

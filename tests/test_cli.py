@@ -82,6 +82,8 @@ def test_stages_and_recipes_are_listed() -> None:
         (["inspect", "nowhere"], 1, "no such file or folder"),
         (["stages", "edge"], 1, "did you mean 'edges'"),
         (["view", "nowhere"], 1, "no recording here"),
+        (["view", "{graph}"], 1, "no Rerun recording (.rrd): name a run folder"),
+        (["view", "{tmp}"], 1, "no run folder: name the folder that `hodge run … --out` wrote"),
         (["run", "demo", "--source", ".", "--set", "solver=hodgee", "--out", "x"], 1, "hodgee: solver: no stage"),
         (["inspect", "{graph}", "--reader", "tmu"], 1, "did you mean 'tum'"),
         (["solve", "{graph}", "--out", "{tmp}"], 1, "is a folder: give the name of a file in it"),

@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
+from hodge_adapters.clouds.ply import write_ply
+from hodge_adapters.clouds.reader import CloudFolderReader
 from hodge_adapters.colmap.reader import ColmapReader
 from hodge_pipeline import se3
 from hodge_pipeline.cli.list import next_command
@@ -21,7 +23,7 @@ from hodge_pipeline.sources.frame_facts import frame_facts
 from hodge_pipeline.sources.graph_facts import graph_facts
 from hodge_pipeline.sources.inspect import inspect
 from hodge_pipeline.store.artifacts import json_text
-from hodge_pipeline.types import Camera, Frame, ViewGraph
+from hodge_pipeline.types import Camera, Frame, PointCloud, ViewGraph
 
 CAMERA = Camera(4, 3, 10, 10, 2, 1.5)
 
@@ -241,3 +243,25 @@ def test_of_a_long_folder_a_few_images_are_decoded(data_dir: Path, monkeypatch: 
     # depth and colour, of frames looked into and of those that tell the colour camera
     assert 0 < len(decoded) <= 2 * (8 + 8)
     assert facts["frames"] == 250 and facts["frames looked into"] == 8 and facts["oddities"] == []
+
+
+def test_scans_without_points_and_with_many_that_are_no_numbers_are_named() -> None:
+    whole = PointCloud(np.random.default_rng(0).uniform(-3, 3, (100, 3)).astype(np.float32))
+    half = PointCloud(whole.points_in_cam[:50], no_numbers=50)
+    clouds, oddities = [whole, half, PointCloud(whole.points_in_cam[:0]), whole, whole], list[str]()
+    frame_facts([Frame(f"{k}.ply", float(k), read_points=partial(clouds.__getitem__, k)) for k in range(5)], oddities)
+    assert "frame 1.ply: 50% of its points are no numbers" in oddities and "frame 2.ply has no points" in oddities
+
+
+def test_a_damaged_las_file_refuses_no_folder(tmp_path: Path) -> None:
+    for name in ("a1", "a2"):
+        write_ply(tmp_path / f"{name}.ply", PointCloud(np.ones((3, 3), np.float32)))
+    (tmp_path / "a3.las").write_bytes(b"LASF" + bytes(40))
+    frames = CloudFolderReader().open(tmp_path).frames
+    assert [frame.frame_id for frame in frames] == ["a1.ply", "a2.ply", "a3.las"]
+    with pytest.raises(SourceError, match="a3.las"):
+        frames[2].read_points()  # type: ignore[misc]
+    for name in ("a1", "a2"):
+        (tmp_path / f"{name}.ply").unlink()
+    with pytest.raises(SourceError, match="a3.las"):
+        CloudFolderReader().open(tmp_path)

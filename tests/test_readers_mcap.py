@@ -128,6 +128,20 @@ def test_colour_by_header_stamp_when_log_times_differ(tmp_path: Path) -> None:
     assert any("have no colour of /cam/color/image within 0.001 s" in note for note in far.notes)
 
 
+@pytest.mark.parametrize(
+    ("encoding", "units", "metres"), [("32FC1", 1000, 2.0), ("32FC1", None, 2000.0), ("16UC1", None, 2.0)]
+)
+def test_depth_scale_is_the_unit_of_floats_too(
+    encoding: str, units: float | None, metres: float, tmp_path: Path
+) -> None:
+    image = raw_image(np.full((6, 8), 2000, "u2" if encoding == "16UC1" else "f4"), encoding)
+    log = Log()
+    log.add(DEPTH, "sensor_msgs/msg/Image", {"header": ros_header(1, OPTICAL), **image}, CDR)
+    source = McapReader(camera=(9, 9, 4, 3), depth_scale=units).open(log.write(tmp_path / "log.mcap"))
+    assert source.frames[0].read_depth is not None
+    np.testing.assert_allclose(source.frames[0].read_depth(), metres)
+
+
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
 def test_raw_depth_of_a_big_endian_machine(tmp_path: Path, encoding: str) -> None:
     values = depth_values().astype("u2" if encoding == "16UC1" else "f4")

@@ -262,3 +262,36 @@ def test_sweeps_are_told_from_stations_and_fragments() -> None:
     for frames, recipe in ((timed, "lidar"), (plain, "lidar"), (half, "scans"), (plain[:5], "scans")):
         facts = {"frames": len(frames), "formats": [{"reader": "clouds"}], **frame_facts(frames, [])}
         assert next_command(Path("in"), facts, None) == f"hodge run {recipe} --source in --out runs/in"
+
+
+def mirrored(cloud: PointCloud) -> PointCloud:
+    return replace(cloud, points_in_cam=cloud.points_in_cam * np.array([-1, 1, 1], np.float32))
+
+
+@pytest.mark.parametrize("row", [12, COUNT - 1], ids=["in the middle", "the last"])
+def test_a_sweep_that_fits_nothing_around_it_is_left_out_and_named(row: int) -> None:
+    frames = street().copy()
+    frames[row] = changed(frames[row], mirrored)
+    found, said = followed(frames)
+    assert (~found.found).nonzero()[0].tolist() == [row]
+    assert f"1 sweep is left out, and posed by neighbours where these are known; the first: {row}.pcd: it fits" in said
+    rows = np.flatnonzero(found.found)
+    assert absolute_error(found.world_from_scan[rows], true_poses(rows)).max_m < NEAR_M
+
+
+def test_a_scene_that_changes_is_followed() -> None:
+    frames = [*street()[:12], *(changed(frame, mirrored) for frame in street()[12:])]
+    found, said = followed(frames)
+    assert found.found.all() and "left out" not in said
+
+
+def test_a_sweep_without_points_in_the_middle_hides_no_scanner_and_is_named() -> None:
+    for spoil, said in ((broken, "12.pcd cannot be read: cut off"), (nothing_of, "12.pcd has no points")):
+        frames, oddities = street().copy(), list[str]()
+        frames[COUNT // 2] = changed(frames[COUNT // 2], spoil)
+        assert "its points have times" in str(frame_facts(frames, oddities)["scanner"])
+        assert sum(said in oddity for oddity in oddities) == 1
+
+
+def nothing_of(cloud: PointCloud) -> PointCloud:
+    return PointCloud(cloud.points_in_cam[:0])

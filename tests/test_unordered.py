@@ -18,7 +18,8 @@ from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
 from hodge_pipeline.registration.colour_evidence import hue_conflicts
 from hodge_pipeline.registration.global_evidence import DepthView
-from hodge_pipeline.stages import no_progress
+from hodge_pipeline.stages import Step, no_progress
+from hodge_pipeline.start.clouds import clouds as make_clouds
 from hodge_pipeline.start.unordered.folds import Pieces, contradictions, unfolded, within_parts
 from hodge_pipeline.start.unordered.hypotheses import (
     AMBIGUOUS,
@@ -29,13 +30,15 @@ from hodge_pipeline.start.unordered.hypotheses import (
     allowed_hue_conflict,
     allowed_violation,
 )
+from hodge_pipeline.start.unordered.mirrored import mirrored_scans
 from hodge_pipeline.start.unordered.options import GlobalStart, HypothesisLimits
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.start.unordered.scan_checks import check_scans, unregistrable
 from hodge_pipeline.start.unordered.start import Frames, Start, _ambiguous_pairs, _none_joined, find_start
 from hodge_pipeline.start.unordered.tour import propose_along_tour, tour
-from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, PointCloud, ViewGraph
+from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, PointCloud, Source, ViewGraph
 from hodge_pipeline.types.edges import REJECTED, USED
+from hodge_pipeline.types.notes import Note
 from scan_data import write_e57
 from test_global_registration import furnished_corner
 
@@ -125,12 +128,23 @@ def test_a_blob_and_five_points_are_said_to_be_so() -> None:
     assert unregistrable(cloud(furnished_corner(0))) == ""
 
 
-def test_copies_and_other_units_are_noticed() -> None:
+def test_copies_are_noticed() -> None:
     corner = furnished_corner(0)
-    clouds = CloudSet.from_clouds([read(corner), read(corner), read(furnished_corner(1)), read(1000 * corner)])
-    notes = check_scans(clouds, np.array([7, 8, 9, 10]))
-    assert any("scan 8: holds the same points as scan 7" in note for note in notes)
-    assert any("scan 10: spans 2e+03 m" in note and "units_per_metre" in note for note in notes)
+    clouds = CloudSet.from_clouds([read(corner), read(corner), read(furnished_corner(1))])
+    assert any("scan 8: holds the same points as scan 7" in note for note in check_scans(clouds, np.array([7, 8, 9])))
+
+
+def test_a_scan_in_millimetres_is_named_though_few_of_its_points_are_in_range(tmp_path: Path) -> None:
+    corner = furnished_corner(0)
+    scans = [read(corner), read(furnished_corner(1)), read(1000 * corner)]
+    frames = [Frame(f"{row}.ply", float(row), read_points=partial(scans.__getitem__, row)) for row in range(3)]
+    said: list[Note] = []
+    step = Step(tmp_path, no_progress, lambda *notes: said.extend(notes))
+    source = Source("corners", tmp_path, tuple(frames))
+    with LocalExecutor(workers=0).open() as workers:
+        make_clouds(source, CloudOptions(max_range_m=20.0), workers=workers, step=step)
+    told = [str(note) for note in said if note.kind == "other units"]
+    assert len(told) == 1 and "2.ply: it seems to have other units" in told[0] and "units_per_metre" in told[0]
 
 
 def test_pieces_lie_beside_each_other() -> None:
@@ -331,3 +345,21 @@ def test_where_no_two_scans_are_joined_the_report_says_what_to_do(pose: Floats |
     (note,) = _none_joined(scene, edges, np.arange(3))
     assert note.kind == "none joined" and todo in note.detail
     assert _none_joined(scene, edges, np.array([0, 0, 1])) == ()
+
+
+@pytest.mark.parametrize("of_reflection, found", [(0.6, [2]), (0.12, [])], ids=["mirrored", "far off"])
+def test_a_scan_whose_reflection_fits_clearly_better_is_mirrored(
+    of_reflection: float, found: list[int], tmp_path: Path
+) -> None:
+    corner = furnished_corner(0)
+    clouds = CloudSet.from_clouds([read(corner)] * 4)
+    pairs = np.array([[0, 1], [0, 3], [1, 3], [0, 2], [2, 3]])
+    overlap = np.array([0.6, 0.5, 0.6, 0.15, 0.12])
+    edges = Edges.of(pairs).put(slice(None), status=USED, overlap=overlap, i_from_j=np.eye(4))
+
+    def match(alone: CloudSet, _folder: Path) -> Edges:
+        np.testing.assert_allclose(alone[0].points_in_cam, corner * [-1, 1, 1], atol=1e-6)
+        at = np.stack([np.zeros(2, int), [1, 2]], axis=1)
+        return Edges.of(at).put(slice(None), status=USED, overlap=np.full(2, of_reflection), i_from_j=np.eye(4))
+
+    assert mirrored_scans(clouds, edges, match, tmp_path).tolist() == found

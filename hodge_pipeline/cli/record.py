@@ -10,6 +10,10 @@ from typing import Any, get_args
 from hodge_pipeline.cli.console import ProgressBars, print_table
 from hodge_pipeline.errors import RecipeError, WorkspaceError
 from hodge_pipeline.recipe.recording_options import Level
+from hodge_pipeline.store.workspace import is_run_folder
+
+RRD_MAGIC = b"RR"
+"""Recordings begin with RRF2, RRF1, RRF0 or RRIO."""
 
 
 def record(run_folder: Path, level: str | None, max_megabytes: float | None, *, quiet: bool) -> None:
@@ -34,9 +38,7 @@ def record(run_folder: Path, level: str | None, max_megabytes: float | None, *, 
 
 def view(run_folder: Path, *, web: bool) -> None:
     """Open the recording in the viewer, or serve it on this machine, and wait until it is closed."""
-    recording = run_folder / "recording.rrd" if run_folder.is_dir() else run_folder
-    if not recording.is_file():
-        raise WorkspaceError(f"{recording}: no recording here: make one with `hodge record RUN --level normal`")
+    recording = _recording_of(run_folder)
     from hodge_pipeline.recording import live
 
     if web:
@@ -55,6 +57,22 @@ def view(run_folder: Path, *, web: bool) -> None:
             viewer.kill()
         if failed:
             raise WorkspaceError(f"{recording}: the viewer ended with an error: try --web")
+
+
+def _recording_of(path: Path) -> Path:
+    """The recording of a run folder, or a file that is one."""
+    if not path.exists():
+        raise WorkspaceError(f"{path}: no recording here, and no run folder: it does not exist")
+    if path.is_file():
+        with path.open("rb") as file:
+            if file.read(len(RRD_MAGIC)) != RRD_MAGIC:
+                raise WorkspaceError(f"{path}: no Rerun recording (.rrd): name a run folder, or its recording.rrd")
+        return path
+    if not (recording := path / "recording.rrd").is_file():
+        if not is_run_folder(path):
+            raise WorkspaceError(f"{path}: no run folder: name the folder that `hodge run … --out` wrote")
+        raise WorkspaceError(f"{recording}: no recording here: make one with `hodge record {path} --level normal`")
+    return recording
 
 
 def compare(first: Path, second: Path, out: Path | None) -> None:

@@ -61,7 +61,7 @@ def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbo
     graph = replace(graph, dimension=dimension_of(graph))
     if options.trust == AUTO and every_pair_tried(vertex_ranks(graph)[graph.edges], graph.vertex_count):
         return _ByCycles.of(graph, options).found
-    backbone = find_backbone(graph, options.trust)
+    backbone = find_backbone(graph, options.trust, most_breaks=options.most_breaks)
     if backbone is not None and not backbone.doubted:
         return backbone
     judged = _ByCycles.of(graph, options)

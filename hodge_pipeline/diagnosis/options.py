@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from hodge_pipeline.solvers.backbone.bridged import MOST_BREAKS
 from hodge_pipeline.solvers.backbone.trust import AUTO
 
 CONSISTENT_FROM = 0.7
@@ -22,6 +23,13 @@ class DiagnosisOptions:
         min_length=1,
         description="edges that are trusted as a backbone: auto learns from the graph whether consecutive edges are "
         "one; sequential trusts these, none no edge; any other word the edges that come from it (`proposed_by`)",
+    )
+    most_breaks: int = Field(
+        default=MOST_BREAKS,
+        ge=0,
+        le=MOST_BREAKS,
+        description="edges of a backbone that loops may call wrong, as where a robot was carried on unnoticed; 0 where "
+        "odometry notices that itself, so that two places alike never outweigh it",
     )
     order_prior: bool = Field(
         default=True,

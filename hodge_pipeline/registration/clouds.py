@@ -16,7 +16,7 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.registration.voxel_means import voxel_means
 from hodge_pipeline.stages import Advance, Workers, in_order, no_progress
-from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats32, Frame, Landmarks, PointCloud
+from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats, Floats32, Frame, Landmarks, PointCloud
 from hodge_pipeline.types.text import counted
 
 FRAMES_IN_BLOCK = 16
@@ -84,6 +84,13 @@ class CloudOptions:
         return min(self.stride, max(1, round(abs(camera.fx) * self.voxel_m / self.max_range_m)))
 
 
+REACH_QUANTILE, REACH_POINTS = 0.99, 100_000
+"""The reach of a scan is that of 99 % of its points, told by so many."""
+FACTOR_OF_UNITS = 50.0
+"""Scans of one scene differ less in reach; millimetres and metres differ by 1000."""
+OTHER_UNITS = "it seems to have other units"
+
+
 class Oddity(NamedTuple):
     """What is odd about a frame's cloud: `what`, the same words for all frames alike, and `why`."""
 
@@ -97,7 +104,7 @@ class Oddity(NamedTuple):
 
 class CloudCounts(NamedTuple):
     """What became of a frame: measurements looked at, those valid and in range, points kept; what is odd, whether its
-    colour image is `blank`, and how many points of a scan are no returns.
+    colour image is `blank`, how many points of a scan are no returns, and its reach in metres, NaN for a depth image.
     """
 
     looked_at: int
@@ -106,6 +113,7 @@ class CloudCounts(NamedTuple):
     odd: Oddity | None = None
     blank: bool = False
     no_returns: int = 0
+    reach_m: float = float("nan")
 
 
 class _Samples(NamedTuple):
@@ -116,6 +124,7 @@ class _Samples(NamedTuple):
     why_none: str = ""
     blank: bool = False
     no_returns: int = 0
+    reach_m: float = float("nan")
 
 
 def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCounts]:
@@ -135,7 +144,8 @@ def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCo
         kept = f"{counted(samples.looked_at, 'point')} to {len(points)}, one a voxel of {options.voxel_m:.3g} m"
         odd = Oddity(frame.frame_id, "down-sampled in parts", kept)
     valid, no_returns = len(samples.points_in_cam), samples.no_returns
-    return cloud, CloudCounts(samples.looked_at, valid, len(points), odd, samples.blank, no_returns)
+    counts = CloudCounts(samples.looked_at, valid, len(points), odd, samples.blank, no_returns, samples.reach_m)
+    return cloud, counts
 
 
 def landmarks_of(options: CloudOptions, frames: Sequence[Frame]) -> CloudSet:
@@ -177,7 +187,18 @@ def prepare_clouds(
         reason = odd[0] if odd else "the source has no frames"
         raise no_clouds(frames, reason)
     odd += [Oddity(frame.frame_id, BLANK) for frame, counts in zip(frames, every, strict=True) if counts.blank]
+    odd += _of_other_units(frames, np.array([counts.reach_m for counts in every]))
     return clouds, shortened(odd) + _no_returns(every)
+
+
+def _of_other_units(frames: Sequence[Frame], reach_m: Floats) -> list[Oddity]:
+    usual = float(np.nanmedian(reach_m)) if np.isfinite(reach_m).any() else np.nan
+    odd = np.flatnonzero((reach_m > FACTOR_OF_UNITS * usual) | (reach_m < usual / FACTOR_OF_UNITS))
+    todo = "write it in those of the others (the reader's units_per_metre is 1000 for millimetres, but holds for all)"
+    return [
+        Oddity(frames[row].frame_id, OTHER_UNITS, f"it reaches {reach_m[row]:.3g} m, the others {usual:.3g} m: {todo}")
+        for row in odd.tolist()
+    ]
 
 
 def in_blocks(frames: Sequence[Frame]) -> list[Sequence[Frame]]:
@@ -291,7 +312,18 @@ def _sensor_points(cloud: PointCloud, options: CloudOptions) -> _Samples:
     why_none = "" if len(kept) else out_of_range(cloud, options)
     zeros = 0 if len(kept) == len(cloud) else int((~(_ranges(cloud) > 0)).sum())  # true for NaN
     lost, points = zeros + cloud.no_numbers, np.asarray(kept.points_in_cam, np.float32)
-    return _Samples(points, colours, len(cloud) + cloud.no_numbers, why_none=why_none, no_returns=lost)
+    return _Samples(
+        points, colours, len(cloud) + cloud.no_numbers, why_none=why_none, no_returns=lost, reach_m=reach_m(cloud)
+    )
+
+
+def reach_m(cloud: PointCloud) -> float:
+    """Metres within which `REACH_QUANTILE` of the points of a scan are, before any is left out for its range; NaN where
+    there is none.
+    """
+    ranges = _ranges(cloud)[:: max(1, len(cloud) // REACH_POINTS)]
+    ranges = ranges[np.isfinite(ranges) & (ranges > 0)]
+    return float(np.quantile(ranges, REACH_QUANTILE)) if len(ranges) else float("nan")
 
 
 def in_range(cloud: PointCloud, options: CloudOptions) -> PointCloud:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import small_gicp
@@ -31,6 +32,13 @@ LEAST = 1e-6
 """Share of the information on translation that every direction keeps, so that the matrix stays positive."""
 UNMATCHED = 9.0
 """Cost of a point without a correspondence, in mean squared errors of the others: as of one three times as far off."""
+STRANGE, USUAL_OF, FEWEST_USUAL = 0.5, 10, 3
+"""A sweep is strange that has half of the usual share of its points on the map: of the median of up to `USUAL_OF`
+sweeps before, at least `FEWEST_USUAL`. On a street with a tunnel it is 0.83 of that and more; of a mirrored sweep 0.42,
+of another city's 0.19, of one in feet 0.01.
+"""
+ON_MAP = 0.5
+"""Finest voxels from a Gaussian of the map within which a point lies on it."""
 ACCELERATION_M_S2, FASTEST_M_S = 5.0, 30.0
 """Sigmas of the motion model: of acceleration, as of a car that brakes hard, and of an unknown velocity."""
 SHARED_ERRORS = 30.0
@@ -41,6 +49,21 @@ MOST_PASSES = 4
 """Passes over the first sweeps, forwards and backwards, for their velocity, at most."""
 MOST_DESKEWS, FARTHER = 3, 0.9
 """A sweep is deskewed again while its new velocity moves its farther points, at this quantile, by half a voxel."""
+
+
+class Step(NamedTuple):
+    """A sweep placed in the map, not yet part of it: `pose` at its middle, `time_s` at which it began, its velocity
+    (6,) with the covariance (3, 3) of the translation; the share of its points on the map, NaN where it could not be
+    aligned; see `ScanToMap` for the others.
+    """
+
+    pose: Floats
+    time_s: float
+    velocity: Floats
+    spread: Floats
+    turn_s: float
+    is_loose: bool
+    on_map: float
 
 
 class ScanToMap:
@@ -58,33 +81,50 @@ class ScanToMap:
         self.velocity, self.pose, self.turn_s, self.is_loose = velocity, np.eye(4), 0.0, False
         self._spread: Floats = FASTEST_M_S**2 * np.eye(3)  # covariance of the velocity, (m/s)^2
         self._time_s: float | None = None
+        self._usual = deque[float](maxlen=USUAL_OF)
 
     def follow(self, cloud: PointCloud, time_s: float) -> None:
         """Find the pose of a sweep that began at `time_s`, which is earlier than the last one's on the way back."""
-        self.turn_s = 0.0 if cloud.times_s is None else float(cloud.times_s.max())
+        self.accept(self.place(cloud, time_s))
+
+    def is_strange(self, step: Step) -> bool:
+        """Whether a sweep fits the map far worse than those before it did."""
+        return len(self._usual) >= FEWEST_USUAL and step.on_map < STRANGE * float(np.median(self._usual))
+
+    def accept(self, step: Step) -> None:
+        """The sweep placed last joins the map, and its motion the filter."""
+        self._map.insert(step.pose)
+        self.pose, self.velocity, self._spread, self._time_s = step.pose, step.velocity, step.spread, step.time_s
+        self.turn_s, self.is_loose = step.turn_s, step.is_loose
+        if np.isfinite(step.on_map):
+            self._usual.append(step.on_map)
+
+    def place(self, cloud: PointCloud, time_s: float) -> Step:
+        """The sweep that began at `time_s` in the map of those before."""
+        turn_s = 0.0 if cloud.times_s is None else float(cloud.times_s.max())
         duration = 0.0 if self._time_s is None else time_s - self._time_s
         before, velocity, rates = self.pose, self.velocity, [self.velocity]
         predicted, spread = before @ se3.exp(velocity * duration), self._spread
-        self._spread = spread = spread + (ACCELERATION_M_S2 * duration) ** 2 * np.eye(3)
+        moved_spread = spread = spread + (ACCELERATION_M_S2 * duration) ** 2 * np.eye(3)
         for _ in range(MOST_DESKEWS):
-            points = deskewed(cloud, rates[-1], self.turn_s / 2).points_in_cam.astype(np.float64)
+            points = deskewed(cloud, rates[-1], turn_s / 2).points_in_cam.astype(np.float64)
             guesses = [before @ se3.exp(velocity * duration)]
             if self._shift_m(velocity, points, abs(duration)) > self._coarsest_m:
                 guesses.append(before)  # after a gap the scanner may be where it was
-            self.pose, information = self._map.align(points, guesses)
-            self.is_loose = information is None and self._time_s is not None
+            pose, information = self._map.align(points, guesses)
+            is_loose = information is None and self._time_s is not None
             if information is None or not duration:  # no velocity from two sweeps of one stamp
                 break
             known = np.linalg.eigvalsh(information[3:, 3:])
-            self.is_loose = bool(known[0] < LOOSE * known.sum())
-            self.pose, moved = _kalman_update(predicted, spread * duration**2, self.pose, information)
-            self._spread = moved / duration**2
-            velocity = se3.log(se3.inverse(before) @ self.pose) / duration
+            is_loose = bool(known[0] < LOOSE * known.sum())
+            pose, moved = _kalman_update(predicted, spread * duration**2, pose, information)
+            moved_spread = moved / duration**2
+            velocity = se3.log(se3.inverse(before) @ pose) / duration
             rates.append(velocity)
-            if not self.turn_s or self._shift_m(rates[-1] - rates[-2], points, self.turn_s / 2) < self._voxel_m / 2:
+            if not turn_s or self._shift_m(rates[-1] - rates[-2], points, turn_s / 2) < self._voxel_m / 2:
                 break
-        self._map.insert(self.pose)
-        self.velocity, self._time_s = velocity, time_s
+        on_map = self._map.share_at(pose) if information is not None else np.nan
+        return Step(pose, time_s, velocity, moved_spread, turn_s, is_loose, on_map)
 
     def _shift_m(self, rates: Floats, points: Floats, seconds: float) -> float:
         """Metres by which a velocity moves the farther points, at quantile `FARTHER`, in this time."""
@@ -99,6 +139,30 @@ def _kalman_update(predicted: Floats, spread_m2: Floats, aligned: Floats, inform
     both = information + known
     moved = np.asarray(np.linalg.solve(both, information @ se3.log(se3.inverse(predicted) @ aligned)))
     return predicted @ se3.exp(moved), np.asarray(np.linalg.inv(both)[3:, 3:])
+
+
+def followed(tracker: ScanToMap, sweeps: Iterable[tuple[int, float, PointCloud]]) -> Iterator[tuple[int, Step | None]]:
+    """Each sweep's row and where it is; None for one that is strange where the next one fits again, or the last.
+
+    Of sweeps, with row and time, two strange ones in a row are a scene that changed, and join the map.
+    """
+    held: tuple[int, float, PointCloud] | None = None
+    for row, time_s, cloud in sweeps:
+        step = tracker.place(cloud, time_s)
+        if tracker.is_strange(step):
+            if held is None:
+                held = (row, time_s, cloud)
+                continue
+            tracker.accept(first := tracker.place(held[2], held[1]))
+            yield held[0], first
+            step = tracker.place(cloud, time_s)
+        elif held is not None:
+            yield held[0], None
+        held = None
+        tracker.accept(step)
+        yield row, step
+    if held is not None:
+        yield held[0], None
 
 
 def first_velocity(voxel_m: float, sweeps: Sequence[tuple[float, PointCloud]]) -> Floats:
@@ -146,6 +210,15 @@ class _Map:
         best = min(held, key=lambda one: one.error + (count - one.num_inliers) * UNMATCHED * usual)
         information = np.asarray(best.H) / (SHARED_ERRORS**2 * max(usual, 1e-12))
         return np.asarray(best.T_target_source), _without_spurious(information, self._spurious)
+
+    def share_at(self, pose: Floats) -> float:
+        """The share of the points of the sweep aligned last that lie on the map, from this pose."""
+        assert self._sweep is not None
+        size_m, voxels = self._levels[-1]
+        found = small_gicp.align(
+            voxels, self._sweep, pose, max_correspondence_distance=ON_MAP * size_m, max_iterations=1
+        )
+        return float(found.num_inliers / self._sweep.size())
 
     def _coarse(self, guess: Floats) -> Floats:
         for level in self._levels[:-1]:

@@ -11,7 +11,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.depth_units import PLAUSIBLE_DEPTH_M, SAMPLED_FRAMES, doubts_of
-from hodge_pipeline.types import Bools, Camera, Floats, Floats32, Frame, Trajectory
+from hodge_pipeline.types import Bools, Camera, Floats, Floats32, Frame, PointCloud, Trajectory
 from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.text import UNKNOWN_UNIT, counted
 
@@ -25,6 +25,12 @@ FEWEST_SWEEPS, SWEEP_POINTS = 10, 300_000
 SECTORS, ALL_ROUND = 36, 0.9
 """Of ten degrees each; the share of them that holds points of a scanner that sees all round it."""
 MOSTLY_EMPTY = 0.9
+ODDLY_LOST = 0.25
+"""Share of a scan's points that are no numbers beyond that of the median scan, from which it is named: organised scans
+of one sensor lose alike.
+"""
+MOST_READ = 10
+"""Sweeps read, from the middle outward, for one with points."""
 
 
 def frame_facts(frames: Sequence[Frame], oddities: list[str], unit: str = METRES) -> dict[str, Any]:
@@ -53,7 +59,7 @@ def frame_facts(frames: Sequence[Frame], oddities: list[str], unit: str = METRES
     if 0 < without < len(frames) and not facts["frames with points"]:
         bare = [str(frame.frame_id) for frame in frames if frame.read_depth is None]
         oddities.append(f"{without} of {len(frames)} frames have no depth: {listed(bare)}")
-    return {**facts, **_depth_facts(frames, oddities), **_scanner_facts(frames)}
+    return {**facts, **_depth_facts(frames, oddities), **_scanner_facts(frames, oddities)}
 
 
 def _cameras(count_of: Counter[Camera]) -> list[str]:
@@ -71,14 +77,12 @@ def _cameras(count_of: Counter[Camera]) -> list[str]:
     ]
 
 
-def _scanner_facts(frames: Sequence[Frame]) -> dict[str, Any]:
-    """Whether the points look like those of a scanner that turns while it moves, by one frame in the middle."""
-    middle = frames[len(frames) // 2]
-    try:
-        cloud = middle.read_points() if middle.read_points else None
-    except (SourceError, OSError):
-        cloud = None
-    if cloud is None or not len(cloud) or len(frames) < FEWEST_SWEEPS:
+def _scanner_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]:
+    """Whether the points look like those of a scanner that turns while it moves, by the frame that is nearest to the
+    middle among those that can be read and have points.
+    """
+    cloud = _middle_cloud(frames, oddities) if len(frames) >= FEWEST_SWEEPS else None
+    if cloud is None:
         return {}
     if cloud.times_s is not None:
         return {"scanner": "turns while it moves: its points have times"}
@@ -86,6 +90,24 @@ def _scanner_facts(frames: Sequence[Frame]) -> dict[str, Any]:
     seen = np.count_nonzero(np.bincount(((turns + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS))
     sees_round = seen >= ALL_ROUND * SECTORS and len(cloud) <= SWEEP_POINTS
     return {"scanner": "sees all round"} if sees_round else {}
+
+
+def _middle_cloud(frames: Sequence[Frame], oddities: list[str]) -> PointCloud | None:
+    middle = len(frames) // 2
+    for row in sorted(range(len(frames)), key=lambda row: abs(row - middle))[:MOST_READ]:
+        read = frames[row].read_points
+        if read is None:
+            return None
+        try:
+            cloud = read()
+        except (SourceError, OSError) as error:
+            oddities.append(f"frame {frames[row].frame_id} cannot be read: {error}")
+            continue
+        if len(cloud):
+            return cloud
+        if (empty := f"frame {frames[row].frame_id} has no points") not in oddities:
+            oddities.append(empty)
+    return None
 
 
 def trajectory_facts(trajectory: Trajectory, oddities: list[str]) -> dict[str, Any]:
@@ -162,11 +184,12 @@ def _note_ids(frames: Sequence[Frame], oddities: list[str]) -> None:
 def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]:
     """Depth range and invalid share of a few frames, evenly over the sequence, and their images that cannot be read."""
     with_depth = [frame for frame in frames if frame.read_depth is not None or frame.read_points is not None]
-    depths, faults = [], []
+    depths, faults, lost_of = list[Floats32](), list[str](), dict[str, float]()
     for row in evenly(len(with_depth), SAMPLED_FRAMES):
         frame = with_depth[row]
         try:
-            depths.append(_depth(frame).ravel())
+            depth, lost = _depth(frame)
+            depths.append(depth.ravel())
         except (SourceError, OSError) as error:
             faults.append(str(error))
             continue
@@ -174,6 +197,13 @@ def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]
         share = float((depths[-1] <= 0).mean()) if depths[-1].size else 1.0
         if share > MOSTLY_EMPTY and frame.read_depth is not None:
             oddities.append(f"frame {frame.frame_id}: {share:.0%} of its pixels have no depth")
+        elif not depths[-1].size:
+            oddities.append(f"frame {frame.frame_id} has no points")
+        lost_of[str(frame.frame_id)] = lost
+    usual = float(np.median(list(lost_of.values()))) if lost_of else 0.0
+    for name, share in lost_of.items():
+        if share > usual + ODDLY_LOST:
+            oddities.append(f"frame {name}: {share:.0%} of its points are no numbers")
     values = np.concatenate(depths) if depths else np.zeros(0)
     valid = values[values > 0]
     median = float(np.median(valid)) if len(valid) else None
@@ -190,12 +220,16 @@ def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]
     }
 
 
-def _depth(frame: Frame) -> Floats32:
-    """The depth image, or the distances of a cloud's points, since a scanner sees all round."""
+def _depth(frame: Frame) -> tuple[Floats32, float]:
+    """The depth image, or the distances of a cloud's points, since a scanner sees all round; and the share of points
+    that are no numbers.
+    """
     if frame.read_depth is not None:
-        return frame.read_depth()
+        return frame.read_depth(), 0.0
     assert frame.read_points is not None
-    return np.asarray(np.linalg.norm(frame.read_points().points_in_cam, axis=1), np.float32)
+    cloud = frame.read_points()
+    distances = np.asarray(np.linalg.norm(cloud.points_in_cam, axis=1), np.float32)
+    return distances, cloud.no_numbers / max(len(cloud) + cloud.no_numbers, 1)
 
 
 def _colour_fault(frame: Frame) -> list[str]:

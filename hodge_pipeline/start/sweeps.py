@@ -15,17 +15,19 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.registration.clouds import (
+    FACTOR_OF_UNITS,
     CloudOptions,
     Oddity,
     in_range,
     make_cloud,
     out_of_range,
+    reach_m,
     shortened,
 )
 from hodge_pipeline.registration.gaps import told_gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, OdometryOptions, chained
 from hodge_pipeline.registration.pairs import register_pairs
-from hodge_pipeline.registration.scan_to_map import ScanToMap, first_velocity
+from hodge_pipeline.registration.scan_to_map import ScanToMap, first_velocity, followed
 from hodge_pipeline.registration.sweeps import deskewed_frame, first_after_s, velocities
 from hodge_pipeline.scene import (
     KeyFrames,
@@ -41,7 +43,6 @@ from hodge_pipeline.stages import Advance, Step, Steps, Workers
 from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
-from hodge_pipeline.start.unordered.scan_checks import FACTOR_OF_UNITS
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Floats32, Frame, Ints, PointCloud, Source
 from hodge_pipeline.types.notes import Note, notes_of
 
@@ -50,10 +51,10 @@ VOXELS_IN_REACH, KEY_FRAMES_IN_REACH = 100, 40
 2023), and 2 m at 80 m."""
 SMALLEST_VOXEL_M = 0.08
 """Four times the usual noise of a range, 2 cm: smaller voxels, as in a room, would hold noise in place of surfaces."""
-REACH_QUANTILE = 0.99
 WARM_UP = 20
 """Sweeps that the first velocity is found on."""
 LEFT_OUT = "the sweep is left out"
+STRANGE = "it fits nothing around it, and the sweeps before and after it fit each other: is it of another place?"
 MOST_LOOSE = 0.5
 """Share of sweeps that tell little of how far the scanner went, above which the whole path is in doubt."""
 LOOKS = 9
@@ -133,7 +134,8 @@ def follow(
         raise SourceError(f"{source.path}: none of the {count} sweeps gave points in range; the first: {odd[0]}")
     step.note(*notes_of("clouds", shortened(odd)))
     if not found.all():
-        step.note(Note("sweeps left out", int((~found).sum()), next(one.why for one in odd if one.what == LEFT_OUT)))
+        first = next(one for one in odd if one.what == LEFT_OUT)
+        step.note(Note("sweeps left out", int((~found).sum()), f"{first.frame}: {first.why}"))
     if loose.any():
         kind = "path loose" if loose.sum() > MOST_LOOSE * found.sum() else "sweeps loose"
         step.note(Note(kind, int(loose.sum()), str(count)))
@@ -161,30 +163,40 @@ class _Followed(NamedTuple):
 def _follow_one(
     frames: list[Frame], stamps_s: Floats, clouds: CloudOptions, voxel_m: float | None, advance: Advance
 ) -> _Followed:
-    count, is_timed, followed, odd = len(frames), False, list[int](), list[Oddity]()
+    count, is_timed, rows, odd = len(frames), False, list[int](), list[Oddity]()
     poses, velocity, middle_s = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6)), np.zeros(count)
-    found, loose = np.zeros(count, bool), np.zeros(count, bool)
-    reach_m, usual_turn_s = _first_look(frames, clouds)
+    found, loose, original = np.zeros(count, bool), np.zeros(count, bool), np.arange(count)
+    usual_m, usual_turn_s = _first_look(frames, clouds)
     times = _times(stamps_s, usual_turn_s)
-    voxel = voxel_m or max(reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
-    first = zip(times, _sweeps(frames[:WARM_UP], clouds, reach_m), strict=False)
+    voxel = voxel_m or max(usual_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
+    first = zip(times, _sweeps(frames[:WARM_UP], clouds, usual_m), strict=False)
     tracker = ScanToMap(voxel, first_velocity(voxel, [(at, one.cloud) for at, one in first if one.cloud]))
-    for row, sweep in enumerate(_sweeps(frames, clouds, reach_m)):
-        if sweep.cloud is not None:
-            tracker.follow(sweep.cloud, times[row])
-            loose[row], is_timed = tracker.is_loose, is_timed or tracker.turn_s > 0
-            middle_s[row] = tracker.turn_s / 2 + first_after_s(sweep.cloud, frames[row].stamp_s)
-            followed.append(row)
-        poses[row] = tracker.pose
-        found[row] = sweep.cloud is not None or sweep.is_copy
-        odd += [] if sweep.odd is None else [sweep.odd]
-        advance(1)
-    if followed:
-        last = np.maximum(np.searchsorted(followed, np.arange(count), side="right") - 1, 0)
-        velocity = velocities(poses[followed], times[followed])[last]
-        middle_s = middle_s[followed][last]
-        poses = poses @ se3.exp(-middle_s[:, None] * velocity)  # to the stamp
-    return _Followed(poses, velocity, found, loose, is_timed, reach_m, odd)
+
+    def read() -> Iterator[tuple[int, float, PointCloud]]:
+        latest = 0
+        for row, sweep in enumerate(_sweeps(frames, clouds, usual_m)):
+            odd.extend([] if sweep.odd is None else [sweep.odd])
+            original[row] = latest if sweep.is_copy else row
+            if sweep.cloud is not None:
+                latest = row
+                middle_s[row] = first_after_s(sweep.cloud, frames[row].stamp_s)
+                yield row, times[row], sweep.cloud
+            advance(1)
+
+    for row, placed in followed(tracker, read()):
+        if placed is None:
+            odd.append(Oddity(frames[row].frame_id, LEFT_OUT, STRANGE))
+            continue
+        poses[row], loose[row], is_timed = placed.pose, placed.is_loose, is_timed or placed.turn_s > 0
+        middle_s[row] += placed.turn_s / 2
+        rows.append(row)
+    if rows:
+        found[rows] = True
+        found = found[original]
+        last = np.maximum(np.searchsorted(rows, np.arange(count), side="right") - 1, 0)
+        velocity = velocities(poses[rows], times[rows])[last]
+        poses = poses[rows][last] @ se3.exp(-middle_s[rows][last][:, None] * velocity)  # to the stamp
+    return _Followed(poses, velocity, found, loose, is_timed, usual_m, odd)
 
 
 def deskewed_along(source: Source, world_from_scan: Floats, clouds: CloudOptions, steps: Steps) -> Source:
@@ -235,8 +247,8 @@ def _sweeps(frames: Iterable[Frame], clouds: CloudOptions, usual_m: float | None
             continue
         if not len(near):
             yield _Sweep(None, Oddity(frame.frame_id, LEFT_OUT, out_of_range(cloud, clouds)))
-        elif usual_m is not None and not 1 / FACTOR_OF_UNITS < (reach_m := _reach_m(cloud)) / usual_m < FACTOR_OF_UNITS:
-            why = f"it reaches {reach_m:.3g} m, the others {usual_m:.3g} m: has it other units (millimetres)?"
+        elif usual_m is not None and not 1 / FACTOR_OF_UNITS < (reach := reach_m(cloud)) / usual_m < FACTOR_OF_UNITS:
+            why = f"it reaches {reach:.3g} m, the others {usual_m:.3g} m: has it other units (millimetres)?"
             yield _Sweep(None, Oddity(frame.frame_id, LEFT_OUT, why))
         elif before is not None and np.array_equal(near.points_in_cam, points):
             why = f"it is given the pose of {before.frame_id}"
@@ -254,13 +266,8 @@ def _first_look(frames: list[Frame], clouds: CloudOptions) -> tuple[float, float
     looks = looks or [s.cloud for s in _sweeps(frames, clouds) if s.cloud is not None][:1]
     if not looks:
         return clouds.max_range_m, 0.0
-    reach_m = np.median([_reach_m(look) for look in looks])
-    return float(reach_m), float(np.median([0.0 if look.times_s is None else look.times_s.max() for look in looks]))
-
-
-def _reach_m(cloud: PointCloud) -> float:
-    ranges = np.linalg.norm(cloud.points_in_cam, axis=1)
-    return float(np.quantile(ranges[np.isfinite(ranges) & (ranges > 0)], REACH_QUANTILE))
+    reach = np.median([reach_m(look) for look in looks])
+    return float(reach), float(np.median([0.0 if look.times_s is None else look.times_s.max() for look in looks]))
 
 
 def _times(stamps_s: Floats, turn_s: float) -> Floats:

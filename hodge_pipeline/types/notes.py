@@ -64,6 +64,9 @@ DOUBTS = {
 """What puts the result in doubt."""
 LOOKS = {
     "option unknown": "{detail}; made by another version: it is left out of what is shown",
+    "other units": "{detail}",
+    "mirrored": "scan {detail} seems mirrored, and is left apart: its reflection fits the scans around it clearly "
+    "better (an axis of the wrong sign, or a left-handed frame?)",
     "not a video": "{count} frames are numbered, and nothing tells how many make a second: each is registered, "
     "and none tracked. Set start.whole_up_to=1 if they are a video",
     "tracking lost": "tracking was lost at {count} {count:frame|frames} ({detail}): {count:its pose is|their poses "

@@ -12,7 +12,7 @@ from hodge_adapters.clouds.columns import ZERO, Columns, Corner, far_corner, poi
 from hodge_adapters.clouds.kitti import raised, read_bin
 from hodge_adapters.clouds.pcd import exceeds_float32, pcd_parts
 from hodge_adapters.clouds.ply import ply_parts
-from hodge_adapters.clouds.scan_files import LIBRARIES, e57_parts, e57_scans, las_corner, las_parts
+from hodge_adapters.clouds.scan_files import LIBRARIES, Scan, e57_parts, e57_scans, las_corner, las_parts
 from hodge_adapters.clouds.tables import table_parts
 from hodge_adapters.clouds.uos import read_uos, uos_pose
 from hodge_adapters.clouds.vtk import vtk_parts
@@ -65,24 +65,33 @@ def fragments_of(files: list[Path], units_per_metre: float, notes: list[str]) ->
     las = [file for file in files if LIBRARIES.get(file.suffix.lower()) == "laspy"]
     found: list[Fragment] = []
     for file in files:
-        scans = e57_scans(file) if file.suffix.lower() == ".e57" else []
+        scans = _e57_scans(file, is_alone=len(files) == 1) if file.suffix.lower() == ".e57" else []
         found += [Fragment(file, scan.row, world_from_scan=_flat(scan.world_from_scan)) for scan in scans]
         found += [] if scans else [Fragment(file, world_from_scan=_flat(uos_pose(file)))]
     others = [fragment for fragment in found if fragment.path not in las and fragment.path.suffix.lower() in PARTS]
-    corner = las_corner(las) if las else ZERO
-    if las:
+    corner = las_corner(las, is_all=len(las) == len(files)) if las else None
+    if corner is not None:
         words = " ".join(f"{value:.3f}" for value in corner)
         notes.append(f"coordinates of {len(las)} LAS files are counted from their common lower corner {words}")
     far = _far_corner(others[0], units_per_metre) if others else ZERO
     if any(far):
-        far = corner if las else far
+        far = corner or far
         words = " ".join(f"{value:.0f}" for value in far)
         notes.append(
             f"{others[0].name}: lies far from zero, where 32-bit numbers lose digits: coordinates of "
             f"{counted(len(others), 'cloud')} are counted from {words}"
         )
-    corners = dict.fromkeys(las, corner) | {fragment.path: far for fragment in others}
+    corners = dict.fromkeys(las, corner or ZERO) | {fragment.path: far for fragment in others}
     return [replace(fragment, corner=corners.get(fragment.path, ZERO)) for fragment in found]
+
+
+def _e57_scans(file: Path, *, is_alone: bool) -> list[Scan]:
+    try:
+        return e57_scans(file)
+    except SourceError:
+        if is_alone:
+            raise
+        return []  # said where the cloud is read
 
 
 def _far_corner(fragment: Fragment, units_per_metre: float) -> Corner:

@@ -40,13 +40,23 @@ class Scan:
     world_from_scan: Floats | None
 
 
-def las_corner(paths: Sequence[Path]) -> Corner:
-    """The lower corner (x, y, z) of all these files, from their headers."""
-    corners = []
+def las_corner(paths: Sequence[Path], *, is_all: bool = True) -> Corner | None:
+    """The lower corner (x, y, z) of those of these files that can be opened, from their headers.
+
+    None where there is none; `is_all`: raises `SourceError` then, since no other file is there to be read.
+    """
+    corners, fault = [], None
     for path in paths:
-        with _named(path, "laspy"), _opened_las(path) as file:
-            _check_points(path, file.header.point_count)
-            corners.append(np.asarray(file.header.mins, float))
+        try:
+            with _named(path, "laspy"), _opened_las(path) as file:
+                _check_points(path, file.header.point_count)
+                corners.append(np.asarray(file.header.mins, float))
+        except SourceError as error:  # said again where the cloud is read
+            fault = error
+    if not corners:
+        if fault is not None and is_all:
+            raise fault
+        return None
     low = np.min(corners, axis=0)
     if not np.isfinite(low).all():
         raise SourceError(f"{paths[0]}: the header's corner is not finite: mend it, or convert the file to PLY")

@@ -31,6 +31,8 @@ Pixels: TypeAlias = NDArray[np.uint8 | np.uint16 | np.float32]
 _DEPTH_HEADER = struct.Struct("<iff")
 _RVL_SIZE = struct.Struct("<II")
 _PNG = b"\x89PNG\r\n\x1a\n"
+UNITS_PER_METRE = 1000.0
+"""Of 16-bit depth in ROS (REP 118)."""
 _RGB = {
     "rgb8": (3, None),
     "bgr8": (3, cv2.COLOR_BGR2RGB),
@@ -108,27 +110,28 @@ def read_depth(
     payload: Payload,
     layout: ImageLayout,
     *,
-    units_per_metre: float,
+    units_per_metre: float | None = None,
     no_depth: tuple[int, ...] = (0,),
 ) -> Floats32:
     """Depth (H, W) in float32 metres, 0 where the image holds one of the `no_depth` values, NaN, or nothing positive.
 
+    `units_per_metre`: None: 1000 of 16-bit depth, 1 of floats, also of those that are coded in 16 bits.
+
     Raises `SourceError` where the bytes are not what the layout says.
     """
     stored = _decoded(payload, layout)
-    if stored.dtype == np.uint16:
-        depth_m: Floats32 = stored.astype(np.float32)
-        if layout.quantisation is None:
-            depth_m *= np.float32(1.0 / units_per_metre)
-        else:
-            a, b = layout.quantisation
-            with np.errstate(divide="ignore", invalid="ignore"):
-                depth_m = np.float32(a) / (depth_m - np.float32(b))
-        for value in no_depth if layout.quantisation is None else (0,):
-            if value or layout.quantisation:
-                depth_m[stored == value] = 0.0
-    else:
-        depth_m = stored.astype(np.float32)
+    depth_m: Floats32 = stored.astype(np.float32)
+    is_whole = stored.dtype == np.uint16 and layout.quantisation is None
+    if layout.quantisation is not None:
+        a, b = layout.quantisation
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth_m = np.float32(a) / (depth_m - np.float32(b))
+        depth_m[stored == 0] = 0.0
+    units = units_per_metre or (UNITS_PER_METRE if is_whole else 1.0)
+    if units != 1.0:
+        depth_m *= np.float32(1.0 / units)
+    for value in no_depth if is_whole else ():
+        depth_m[stored == value] = 0.0
     depth_m[~(np.isfinite(depth_m) & (depth_m > 0))] = 0.0
     return depth_m
 

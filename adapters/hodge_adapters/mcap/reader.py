@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -21,7 +21,7 @@ from hodge_adapters.images.camera_files import Intrinsics, checked
 from hodge_adapters.mcap.clouds import lies_far, read_points
 from hodge_adapters.mcap.files import find_files, sniff_recording
 from hodge_adapters.mcap.fixes import positions_of
-from hodge_adapters.mcap.images import ImageLayout, encoded_image, read_colour, read_depth
+from hodge_adapters.mcap.images import UNITS_PER_METRE, ImageLayout, encoded_image, read_colour, read_depth
 from hodge_adapters.mcap.poses import PoseOptions, find_poses
 from hodge_adapters.mcap.recording import A_MESSAGE_WITH, NO_PINHOLE, Recording, Seen
 from hodge_adapters.mcap.ros_tf import TransformTree
@@ -41,7 +41,6 @@ from hodge_pipeline.types import Camera, EncodedImage, Floats, Frame, Source
 from hodge_pipeline.types.text import counted
 
 Layout = TypeVar("Layout")
-UNITS_PER_METRE = 1000.0
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -58,8 +57,10 @@ class McapReader:
     camera: tuple[float, float, float, float] | None = Field(
         None, description="fx fy cx cy in pixels, for recordings without a calibration"
     )
-    depth_scale: float = Field(
-        UNITS_PER_METRE, gt=0, description="units per metre of 16-bit depth; ROS (REP 118) has millimetres"
+    depth_scale: float | None = Field(
+        None,
+        gt=0,
+        description="units per metre of depth; none: 1000 of 16-bit depth, 1 of floats, as ROS has them (REP 118)",
     )
     no_depth: tuple[int, ...] = Field((0, 65535), description="16-bit values that mean no depth; 65535 is the largest")
     max_difference_s: float = Field(
@@ -147,8 +148,8 @@ class McapReader:
             colour = dict([named_topic(colour, self.colour_topic, "colour_topic")])
         colour_topic = best_colour(colour, topic, images[0], notes)
         coloured = self._associated(topic, images, colour_topic, colour, notes)
-        units = self.depth_scale
-        frames = []
+        units, frames = self.depth_scale or UNITS_PER_METRE, []
+        given: dict[str, Any] = {"units_per_metre": self.depth_scale, "no_depth": self.no_depth}
         for row, (image, other) in enumerate(zip(images, coloured, strict=True)):
             is_plain_png = image.layout.coding == "png" and image.layout.quantisation is None
             frames.append(
@@ -156,9 +157,7 @@ class McapReader:
                     frame_id=row,
                     stamp_s=image.stamp_s,
                     camera=camera,
-                    read_depth=partial(
-                        read_depth, image.payload, image.layout, units_per_metre=units, no_depth=self.no_depth
-                    ),
+                    read_depth=partial(read_depth, image.payload, image.layout, **given),
                     encoded_depth=partial(encoded_image, image.payload, image.layout, units) if is_plain_png else None,
                     read_colour=partial(read_colour, other.payload, other.layout) if other else None,
                     encoded_colour=_encoded_colour(other),

@@ -200,7 +200,7 @@ def _add_calibration(recording: Recording, message: Message, path: Path, logged:
         is_distorted=bool(np.any(distortion != 0)),
     )
     if recording.calibrations.setdefault(topic, calibration) != calibration:
-        recording.complaints.count(topic, "a calibration that differs from the topic's first")
+        recording.complaints.count(topic, "a calibration that differs from the topic's first, which all frames get")
 
 
 def _add_pose(recording: Recording, message: Message, path: Path, logged: Logged) -> None:

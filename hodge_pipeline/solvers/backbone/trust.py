@@ -123,12 +123,15 @@ class Backbone:
         return f"{trusted}{called_wrong}, {used} of {loops} loops confirmed{errors}"
 
 
-def find_backbone(graph: ViewGraph, trust: str = AUTO, *, in_lattice: bool = False) -> Backbone | None:
+def find_backbone(
+    graph: ViewGraph, trust: str = AUTO, *, in_lattice: bool = False, most_breaks: int = MOST_BREAKS
+) -> Backbone | None:
     """The backbone of a graph; None where it has none that should be trusted.
 
     - `trust`: `auto` learns from the graph whether its consecutive edges are a backbone, which those of a lattice or a
       room are not; `sequential` trusts them, `none` no edge; any other word the edges of that `source`.
     - `in_lattice`: the backbone, without breaks, of a lattice or a room, and None elsewhere.
+    - `most_breaks`: steps that loops may call wrong.
 
     Raises `GraphError` where there are no such edges.
     """
@@ -141,14 +144,14 @@ def find_backbone(graph: ViewGraph, trust: str = AUTO, *, in_lattice: bool = Fal
         repeats &= np.isin(pair, pair[_in_order(graph, repeats)])
     single = fused(graph, repeats)
     single = windowed(single) if trust in (AUTO, SEQUENTIAL) else single
-    backbone = _of_single_steps(single.graph, trust, in_lattice)
+    backbone = _of_single_steps(single.graph, trust, in_lattice, most_breaks)
     if backbone is None:
         return None
     named = backbone.named if trust in (AUTO, SEQUENTIAL) else f"edges of {trust}"
     return _of_all_edges(graph, replace(backbone, named=named), single)
 
 
-def _of_single_steps(graph: ViewGraph, trust: str, in_lattice: bool) -> Backbone | None:
+def _of_single_steps(graph: ViewGraph, trust: str, in_lattice: bool, most_breaks: int) -> Backbone | None:
     """The backbone of a graph with one edge for each step: see `find_backbone`."""
     chosen = sequential_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
     if trust == AUTO and chosen.sum() < max(FEWEST_STEPS, COVERED * graph.vertex_count):
@@ -166,7 +169,7 @@ def _of_single_steps(graph: ViewGraph, trust: str, in_lattice: bool) -> Backbone
     if in_lattice and not many_loops or not in_lattice and many_loops and is_tested(chain):
         return None
     trusted = chosen[chain.loop_edge]  # edges of a trusted source that are in no path
-    most = 0 if in_lattice else FEW_BREAKS if many_loops else MOST_BREAKS
+    most = 0 if in_lattice else min(most_breaks, FEW_BREAKS if many_loops else MOST_BREAKS)
     inferred = infer_bridged(chain, trusted, in_lattice or not many_loops, most)
     if inferred is None:
         return None

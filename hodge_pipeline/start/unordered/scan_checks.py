@@ -1,4 +1,4 @@
-"""Checks of scans before registration: unit mismatch, duplicates, surfaces that leave a motion undetermined."""
+"""Checks of scans before registration: duplicates, surfaces that leave a motion undetermined."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from hodge_pipeline.registration.global_evidence import free_directions
 from hodge_pipeline.registration.global_features import FEWEST_POINTS
 from hodge_pipeline.types import CloudSet, Floats, PointCloud
 
-FACTOR_OF_UNITS = 50.0
-"""Scans of one scene differ less in extent; millimetres and metres differ by 1000."""
 SURFACE_NEIGHBOURS = 30
 SAMPLED_POINTS = 2000
 VOLUME = 0.12
@@ -19,8 +17,8 @@ VOLUME = 0.12
 
 
 def check_scans(clouds: CloudSet, names: NDArray[np.generic]) -> tuple[str, ...]:
-    """One line for each scan whose shape cannot be registered, that is a copy, or that seems to have other units."""
-    notes = [*_units(clouds, names), *_copies(clouds, names)]
+    """One line for each scan whose shape cannot be registered, or that is a copy."""
+    notes = _copies(clouds, names)
     for name, cloud in zip(names, clouds, strict=True):
         reason = unregistrable(cloud) if len(cloud) else ""
         if reason:
@@ -49,17 +47,6 @@ def surface(points: Floats, queries: Floats) -> tuple[Floats, Floats]:
     centred = near - near.mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("qki,qkj->qij", centred, centred))
     return vectors[:, :, 0], np.maximum(values[:, 0], 0) / np.maximum(values.sum(axis=1), 1e-30)
-
-
-def _units(clouds: CloudSet, names: NDArray[np.generic]) -> list[str]:
-    extents = np.array([np.ptp(c.points_in_cam, axis=0).max() if len(c) else np.nan for c in clouds])
-    usual = float(np.nanmedian(extents)) if np.isfinite(extents).any() else np.nan
-    odd = np.flatnonzero((extents > FACTOR_OF_UNITS * usual) | (extents < usual / FACTOR_OF_UNITS))
-    return [
-        f"scan {names[row]}: spans {extents[row]:.3g} m, the others about {usual:.3g} m: has it other units? "
-        "(a reader's units_per_metre: 1000 for millimetres)"
-        for row in odd.tolist()
-    ]
 
 
 def _copies(clouds: CloudSet, names: NDArray[np.generic]) -> list[str]:

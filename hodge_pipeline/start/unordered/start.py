@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -20,9 +20,10 @@ from hodge_pipeline.registration.global_pairs import describe_clouds, load_descr
 from hodge_pipeline.registration.odometry_path import contradicts_odometry
 from hodge_pipeline.scene import Drift
 from hodge_pipeline.solvers.backbone.trust import SEQUENTIAL
-from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers
+from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers, no_progress
 from hodge_pipeline.start.unordered.folds import Pieces, unfolded
 from hodge_pipeline.start.unordered.hypotheses import AMBIGUOUS, weigh
+from hodge_pipeline.start.unordered.mirrored import mirrored_scans
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.start.unordered.pieces import laid_apart
 from hodge_pipeline.start.unordered.scan_checks import check_scans
@@ -65,6 +66,12 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     notes = [] if by_image or scene.given is not None else [*check_scans(clouds, scene.vertex_ids)]
     hypotheses, views = weighed_matches(scene, np.flatnonzero(clouds.sizes > 0), options, scratch, workers, advance)
     notes.append(tried(int((clouds.sizes > 0).sum()), hypotheses))
+    mirrored = np.zeros(0, np.int64)
+    if not by_image and scene.given is None and all(frame.camera is None for frame in scene.frames):
+        alike = partial(_matched_alone, options=options, workers=workers)
+        mirrored = mirrored_scans(clouds, hypotheses, alike, scratch)
+        of_mirrored = np.flatnonzero(hypotheses.counts & np.isin(hypotheses.pairs, mirrored).any(axis=1))
+        hypotheses = hypotheses.put(of_mirrored, status=REJECTED, why="one of the two seems mirrored")
     measured = hypotheses.as_graph(scene.vertex_ids, hypotheses.counts)
     graph = measured
     if scene.given is not None:
@@ -77,8 +84,20 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     notes += [*pieces.notes, *describe_components(pieces.piece, scene.vertex_ids)]
     advance(len(scene.frames))
     poses = laid_apart(pieces.piece, pieces.poses, clouds)
-    told = (*_ambiguous_pairs(hypotheses, pieces.piece), *_none_joined(scene, hypotheses, pieces.piece))
+    told = (
+        *(Note("mirrored", detail=str(scene.vertex_ids[row])) for row in mirrored),
+        *_ambiguous_pairs(hypotheses, pieces.piece),
+        *_none_joined(scene, hypotheses, pieces.piece),
+    )
     return Start(poses, Edges.measured(pieces.graph), pieces.piece, (*told, *notes_of("start", notes)))
+
+
+def _matched_alone(clouds: CloudSet, folder: Path, options: GlobalStart, workers: Workers) -> Edges:
+    """All pairs of these clouds, without images, matched and weighed."""
+    frames = [Frame(row, float(row)) for row in range(len(clouds))]
+    every = replace(options, all_pairs_up_to=len(clouds))
+    scene = Frames(frames, folder, np.arange(len(clouds)))
+    return weighed_matches(scene, np.arange(len(clouds)), every, folder, workers, no_progress)[0]
 
 
 def _ambiguous_pairs(hypotheses: Edges, piece: Ints) -> tuple[Note, ...]:
