@@ -15,6 +15,7 @@ from hodge_pipeline.solvers.backbone.parallel import FEWEST, fused
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.types import Ints, ViewGraph
 from tests.backbone_graphs import STEP, drive
+from tests.test_backbone_window import with_window
 
 
 def with_second_odometry(
@@ -107,3 +108,46 @@ def test_edges_of_another_source_are_not_trusted_with_the_one_that_is() -> None:
     source = np.where(np.arange(graph.edge_count) < made.edge_count, "wheels", "scans")
     backbone = find_backbone(replace(graph, source=source), "wheels")
     assert backbone is not None and backbone.steps[rows].all() and not backbone.steps[made.edge_count :].any()
+
+
+def with_copies(graph: ViewGraph, row: int, times: int, apart: float = 1e-4) -> ViewGraph:
+    """The graph and, behind its edges, one loop so many times more, every other one written the other way round."""
+    rng, axes = np.random.default_rng(0), [2, 3, 4] if graph.dimension == 2 else range(6)
+    more, noise = graph.select(np.full(times, row)), np.zeros((times, 6))
+    noise[:, axes] = apart * rng.normal(size=(times, len(axes)))
+    motions, edges, information = more.i_from_j @ se3.exp(noise), more.edges.copy(), more.information.copy()
+    motions[::2], edges[::2] = se3.inverse(motions[::2]), edges[::2, ::-1]
+    information[::2] = se3.pull_back(motions[::2], information[::2])
+    return ViewGraph.joined([graph, replace(more, edges=edges, i_from_j=motions, information=information)])
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_copies_of_a_loop_count_once(stated: bool) -> None:
+    """Their common error set the scale of errors: right loops were lost, and in a real graph a right step."""
+    made = drive(wrong=0.3, loops=20)
+    wrong = int(np.flatnonzero(~made.right)[0])
+    graph = with_copies(made.graph, wrong, 100)
+    if not stated:
+        graph = replace(graph, information=np.tile(np.eye(6), (graph.edge_count, 1, 1)))
+    found, alone = diagnose(graph), diagnose(graph.select(np.arange(made.graph.edge_count)))
+    np.testing.assert_array_equal(found.kept[: made.graph.edge_count], alone.kept)
+    copies = found.verdict[made.graph.edge_count :]
+    assert set(copies.tolist()) == {alone.verdict[wrong]} and alone.kept[consecutive_edges(made.graph)].all()
+    np.testing.assert_allclose(found.world_from_cam, alone.world_from_cam, atol=1e-2)
+
+
+def test_a_loop_that_is_written_again_otherwise_is_no_copy() -> None:
+    made = drive(wrong=0.0, loops=40)
+    row = int(np.flatnonzero(~consecutive_edges(made.graph))[3])
+    graph = with_copies(made.graph, row, 2)
+    motions = graph.i_from_j.copy()
+    motions[-1] = motions[-1] @ se3.exp(np.array([0, 0, 0.5, 3.0, 0, 0]))
+    found = diagnose(replace(graph, i_from_j=motions))
+    assert found.kept[:-1].all() and found.verdict[-1] == "wrong"
+
+
+def test_copies_of_an_edge_of_a_window_are_of_its_steps() -> None:
+    made, _ = with_window(drive(wrong=0.0, loops=20), 3)
+    graph = with_copies(made.graph, made.graph.edge_count - 5, 30)
+    backbone = find_backbone(graph)
+    assert backbone is not None and backbone.merged[made.graph.edge_count :].all() and backbone.used.all()

@@ -177,6 +177,19 @@ def test_an_exact_window_in_any_unit_is_one(stated: bool, unit: float) -> None:
     assert found.kept.all() and made.error_m(se3.rescaled(found.world_from_cam, 1 / unit)) < 1e-6
 
 
+@pytest.mark.parametrize("stated", [True, False])
+def test_the_rounding_of_an_optimised_graph_calls_no_edge_wrong(stated: bool) -> None:
+    """Long numbers are rounded more than short ones: those fell out of the window."""
+    made, _ = with_window(drive(wrong=0.0, loops=20), 3)
+    (i, j), rng = made.graph.edges.T, np.random.default_rng(0)
+    motions = se3.inverse(made.truth[i]) @ made.truth[j]
+    digits = rng.choice([0.01, 1.0], (len(motions), 1), p=[0.95, 0.05])
+    last_digit = _noise(rng, np.repeat([1e-5, 1e-4], 3) * digits, planar=True)
+    information = made.graph.information if stated else np.tile(np.eye(6), (len(motions), 1, 1))
+    graph = replace(made.graph, i_from_j=motions @ se3.exp(last_digit), information=information)
+    assert diagnose(graph).kept.all()
+
+
 def test_edges_of_a_window_are_loops_beside_the_edges_of_a_source() -> None:
     graph = with_window(drive(wrong=0.0, loops=60), 3)[0].graph
     steps: Bools = np.arange(graph.edge_count) < graph.vertex_count - 1

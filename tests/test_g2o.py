@@ -109,9 +109,33 @@ def test_what_is_not_read_is_counted(tmp_path):
     assert "1 of 2 vertices are named by edges only: no initial poses" in notes
 
 
+def test_loops_that_may_be_switched_off_are_edges(tmp_path):
+    """Vertigo's: the switch is a third id, the weight of a mixture stands before the motion."""
+    spatial = EDGE.replace("EDGE_SE3:QUAT 7 3", "EDGE_SE3_SWITCHABLE 7 5 9")
+    source = load_g2o(write(tmp_path / "s.g2o", EDGE, spatial, "VERTEX_SWITCH 9 1", "EDGE_SWITCH_PRIOR 9 1 1"))
+    assert source.graph is not None and source.graph.edges.tolist() == [[0, 1], [0, 2]]
+    np.testing.assert_array_equal(*source.graph.i_from_j)
+    np.testing.assert_array_equal(*source.graph.information)
+    assert "1 line of kind VERTEX_SWITCH not read: switches of loops, which are judged anew" in source.notes
+    assert "1 edge of kind EDGE_SE3_SWITCHABLE read as EDGE_SE3:QUAT, whatever the switch or weight" in source.notes
+    step, loop = "1 2 .3 4 0 0 5 0 6", "2 3 .4 7 0 0 8 0 9"
+    lines = f"EDGE_SE2 0 1 {step}", f"EDGE_SE2_SWITCHABLE 1 2 9 {loop}", f"EDGE_SE2_MAXMIX 0 2 0.01 {loop}"
+    plain = f"EDGE_SE2 0 1 {step}", f"EDGE_SE2 1 2 {loop}", f"EDGE_SE2 0 2 {loop}"
+    found, expected = (load_g2o(write(tmp_path / "p.g2o", *each)).graph for each in (lines, plain))
+    for name in ("vertex_ids", "edges", "i_from_j", "information"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+def test_of_a_switched_loop_beside_steps_without_information_the_motion_is_read(tmp_path):
+    source = load_g2o(write(tmp_path / "u.g2o", "EDGE_SE2 0 1 1 0 0", "EDGE_SE2_SWITCHABLE 0 2 9 2 0 0 4 0 0 5 0 6"))
+    assert source.graph is not None
+    np.testing.assert_array_equal(source.graph.information[0], source.graph.information[1])
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [
+        ("EDGE_SE3_SWITCHABLE 1 2 3 0 0", ":2: EDGE_SE3_SWITCHABLE needs 28 numbers after its ids, has 2"),
         ("EDGE_SE3:QUAT 1 2 0 0 0", ":2: EDGE_SE3:QUAT needs 28 numbers after its ids, has 3"),
         (EDGE.replace("1 2 3", "1 two 3"), ":2: 'two' is no number"),
         (EDGE.replace("7 3", "7 x3"), ":2: 'x3' is no 64-bit integer id"),

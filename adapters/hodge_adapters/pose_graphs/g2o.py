@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass as stage
 
-from hodge_adapters.pose_graphs import g2o_priors
+from hodge_adapters.pose_graphs import g2o_priors, g2o_switches
 from hodge_adapters.pose_graphs.text import LANDMARK_TAGS, Records, count_tags, read_records, write_lines
 from hodge_adapters.posed import graph_of, length_notes, written_graph
 from hodge_adapters.text_rows import write_text_atomically
@@ -204,6 +204,8 @@ def skipped(other: dict[str, int]) -> list[str]:
 
 
 def _meaning(tag: str) -> str:
+    if tag in g2o_switches.SWITCH_TAGS:
+        return ": switches of loops, which are judged anew"
     return ": landmarks, where only edges between poses are solved" if tag in LANDMARK_TAGS else ""
 
 
@@ -214,7 +216,8 @@ def refuse_landmarks_alone(path: Path, other: dict[str, int]) -> None:
         raise SourceError(f"{path}: holds landmarks alone ({', '.join(tags)}): edges between poses are needed")
 
 
-KEYS = {"VERTEX_SE3:QUAT": 1, "EDGE_SE3:QUAT": 2, "VERTEX_SE2": 1, "EDGE_SE2": 2, "FIX": 1, **g2o_priors.KEYS}
+KEYS = {"VERTEX_SE3:QUAT": 1, "EDGE_SE3:QUAT": 2, "VERTEX_SE2": 1, "EDGE_SE2": 2, "FIX": 1}
+KEYS |= g2o_priors.KEYS | g2o_switches.KEYS
 SPATIAL_TAGS = (
     *("VERTEX_SE3:QUAT", g2o_priors.SPATIAL, g2o_priors.SPATIAL_OFFSET, g2o_priors.OFFSET),
     *(g2o_priors.SPATIAL_XYZ, g2o_priors.SPATIAL_XY),
@@ -227,6 +230,7 @@ COLUMNS = {
     "EDGE_SE2": (9, 3),
     "FIX": None,
     **g2o_priors.COLUMNS,
+    **g2o_switches.COLUMNS,
 }
 """Edges without information are what LIO-SAM's descendants write."""
 
@@ -238,6 +242,7 @@ def load_g2o(path: Path | str) -> Source:
     """
     path = Path(path)
     records, other = read_records(path, KEYS, COLUMNS)
+    records, told = g2o_switches.as_edges(records)
     spatial, planar = len(records["EDGE_SE3:QUAT"]), len(records["EDGE_SE2"])
     if spatial and planar:
         raise SourceError(f"{path}: holds both EDGE_SE3:QUAT and EDGE_SE2: split it, one dimension to a file")
@@ -246,7 +251,6 @@ def load_g2o(path: Path | str) -> Source:
         raise SourceError(f"{path}: no g2o vertex or edge in it: expected lines such as EDGE_SE3:QUAT or EDGE_SE2")
     more_planar = len(records["VERTEX_SE2"]) > len(records["VERTEX_SE3:QUAT"])
     dimension = 2 if planar or (not spatial and more_planar) else 3
-    told: list[str] = []
     half = (_planar if dimension == 2 else _spatial)(records, told)
     strange = {tag: len(records[tag]) for tag in (SPATIAL_TAGS if dimension == 2 else PLANAR_TAGS) if len(records[tag])}
     notes = skipped({**other, **strange}) + told

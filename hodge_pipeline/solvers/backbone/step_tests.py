@@ -92,9 +92,12 @@ AS_STATED = 3.0
 
 def gate(chain: Chain) -> tuple[float, float]:
     """The gate for closing errors of cycles of right edges: metres, radians."""
-    inner = np.flatnonzero(chain.step_edge >= 0)
-    shift = np.linalg.norm(chain.step[inner, :3, 3], axis=1)
-    turn = se3.rotation_angle(chain.step[inner])
+    return gate_of(chain.step[chain.step_edge >= 0])
+
+
+def gate_of(steps: Floats) -> tuple[float, float]:
+    """The gate by the motions (N, 4, 4) of all steps."""
+    shift, turn = np.linalg.norm(steps[:, :3, 3], axis=1), se3.rotation_angle(steps)
     return float(np.median(shift)) / OF_STEPS, max(float(np.median(turn)), TURN_RAD) / OF_STEPS
 
 

@@ -22,13 +22,13 @@ from hodge_pipeline.solvers.backbone.chain import (
 )
 from hodge_pipeline.solvers.backbone.inference import Inferred
 from hodge_pipeline.solvers.backbone.linear import Linear
-from hodge_pipeline.solvers.backbone.parallel import Fused, fused
+from hodge_pipeline.solvers.backbone.parallel import Fused, fused, loops_once
 from hodge_pipeline.solvers.backbone.polish import LOCAL
 from hodge_pipeline.solvers.backbone.step_tests import LOOPS_AT_A_STEP, agreeing_loops, is_tested
 from hodge_pipeline.solvers.backbone.window import windowed
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.weights import moves_in_plane
-from hodge_pipeline.types import Bools, Floats, ViewGraph
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 from hodge_pipeline.types.text import counted
 
 AUTO, SEQUENTIAL, NONE = "auto", "sequential", "none"
@@ -138,11 +138,12 @@ def find_backbone(
     if trust == NONE or not graph.edge_count:
         return None
     graph = replace(graph, dimension=2 if moves_in_plane(graph) else 3)
-    repeats = consecutive_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
+    chosen = consecutive_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
+    repeats = chosen.copy()
     if trust not in (AUTO, SEQUENTIAL):  # repeats of edges outside its paths are loops, as these edges are
         pair = np.sort(graph.edges, axis=1) @ [graph.vertex_count, 1]
         repeats &= np.isin(pair, pair[_in_order(graph, repeats)])
-    single = fused(graph, repeats)
+    single = loops_once(fused(graph, repeats), ~chosen) if chosen.any() else fused(graph, repeats)
     single = windowed(single) if trust in (AUTO, SEQUENTIAL) else single
     backbone = _of_single_steps(single.graph, trust, in_lattice, most_breaks)
     if backbone is None:
@@ -215,14 +216,17 @@ def _backbone(
 
 def _of_all_edges(graph: ViewGraph, backbone: Backbone, one: Fused) -> Backbone:
     """The backbone of the fused graph `one`, in rows of `graph`; a merged edge is used where none of its steps is
-    broken.
+    broken, a copy where what it is fused into is.
     """
     chain, rows = backbone.chain, np.append(one.rows, -1)
     chain = replace(chain, step_edge=rows[chain.step_edge], loop_edge=one.rows[chain.loop_edge])
+    chain, again, one = _with_copies(chain, one)
     steps, used, merged, contradicted = np.zeros((4, graph.edge_count), bool)
     right, chi2 = np.full((2, graph.edge_count), np.nan)
     steps[one.rows], used[one.rows] = backbone.steps, backbone.used
     right[one.rows], chi2[one.rows] = backbone.right, backbone.chi2
+    for value in (used, right, chi2):
+        value[one.copies] = value[one.copied]
     merged[one.merged] = steps[one.merged] = contradicted[one.contradicted] = True
     used &= ~(steps & contradicted)
     contradicted &= ~used
@@ -237,9 +241,25 @@ def _of_all_edges(graph: ViewGraph, backbone: Backbone, one: Fused) -> Backbone:
         used=used,
         right=right,
         chi2=chi2,
+        loop_width=backbone.loop_width[again] * np.sqrt(np.bincount(again)[again]),
         merged=merged,
         contradicted=contradicted,
     )
+
+
+def _with_copies(chain: Chain, one: Fused) -> tuple[Chain, Ints, Fused]:
+    """The chain with copies as loops of their own, which of its loops each is (M',), and the fused graph whose copies
+    are of loops alone: those of loops that a window took are merged or contradicted as these are.
+    """
+    place = dict(zip(chain.loop_edge.tolist(), range(len(chain.loop_edge)), strict=True))
+    is_loop = np.isin(one.copied, chain.loop_edge)
+    again = np.array([*place.values(), *(place[row] for row in one.copied[is_loop].tolist())], np.int64)
+    merged, contradicted = (
+        np.concatenate([rows, one.copies[np.isin(one.copied, rows)]]) for rows in (one.merged, one.contradicted)
+    )
+    copies, copied = one.copies[is_loop], one.copied[is_loop]
+    one = replace(one, merged=merged, contradicted=contradicted, copies=copies, copied=copied)
+    return replace(chain.with_loops(again, chain.ends[again]), loop_edge=np.append(chain.loop_edge, copies)), again, one
 
 
 def of_every_loop(graph: ViewGraph, backbone: Backbone, trusted: Bools) -> Backbone:

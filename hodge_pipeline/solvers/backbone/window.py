@@ -37,6 +37,10 @@ of which was tried, .69 to .84 do, of the cubicle's .6; of graphs whose odometry
 """
 ROUNDS = 10
 """Reweighted solves: a limit on cost."""
+WRITTEN, TURNED_RAD = 5e-6, 10.0
+"""Largest rounding error, as a share of the number, where six digits are written, as streams of C++ do; and an angle
+that was not taken back to half a turn.
+"""
 TOLERANCE, LEAST = 1e-4, 1e-9
 """Relative tolerance of χ² of each solve, and the least weight of an edge, so that the graph stays connected."""
 
@@ -76,7 +80,7 @@ def windowed(given: Fused) -> Fused:
     left = np.setdiff1d(np.arange(graph.edge_count), chain.loop_edge[near])
     fused = replace(graph, edges=edges, i_from_j=motions, information=information).select(left)
     merged = np.concatenate([given.merged, given.rows[chain.loop_edge[good]]])
-    return Fused(fused, given.rows[left], merged, given.rows[contradicted])
+    return replace(given, graph=fused, rows=given.rows[left], merged=merged, contradicted=given.rows[contradicted])
 
 
 def _near(chain: Chain) -> Ints:
@@ -125,7 +129,8 @@ def _agreeing(chain: Chain, near: Ints) -> tuple[Floats, Floats]:
     low, high = chain.poses[ends[:, 0]], chain.poses[ends[:, 1]]
     closing = closes(chain.motion[near], se3.inverse(low) @ high, gate(chain), np.sqrt(np.diff(ends, axis=1)[:, 0]))
     usual = chi2[closing | (chain.stated & (chi2 < AS_STATED * size))]
-    scale = max(float(np.median(usual)) / MEDIAN_CHI2[size], EXACT) if len(usual) else 1.0
+    usual_scale = float(np.median(usual)) / MEDIAN_CHI2[size] if len(usual) else 1.0
+    scale = max(usual_scale, 1.0 if chain.stated else _rounding(chain, near))
     fits = chi2 <= STUDENT_99[size] * scale
     doubted = chain.over(ends[fits]) == 0
     over = np.append(0, np.cumsum(doubted & chain.inner))
@@ -157,6 +162,14 @@ def _agreeing(chain: Chain, near: Ints) -> tuple[Floats, Floats]:
             break
         poses = solved(weights, poses)
     return np.where(chi2 <= STUDENT_99[size], weights, 0.0), poses
+
+
+def _rounding(chain: Chain, near: Ints) -> float:
+    """The χ² per axis of what rounding of coordinates may displace a loop by: no edge is wrong for that."""
+    extent = max(float(np.ptp(chain.poses[:, :3, 3], axis=0).max()), np.finfo(float).tiny)
+    written = WRITTEN * np.where(chain.axes < 3, TURNED_RAD, extent)
+    chi2 = mahalanobis(np.tile(written, (len(near), 1)), chain.covariance[near])[0]
+    return float(np.median(chi2)) / len(written)
 
 
 def _information(chain: Chain, poses: Floats, own: Floats, near: Ints, weights: Floats) -> Floats:
