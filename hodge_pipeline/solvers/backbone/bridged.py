@@ -114,7 +114,8 @@ def _better(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]
         if same is None or same.log_evidence <= found.log_evidence + least:
             continue
         if broken.usual or same.start.chain.corridors_over(broken.at, np.flatnonzero(same.used)) > 1:
-            return tried, judge(tried) or same
+            again = judge(tried)
+            return tried, same if again is None or again.log_evidence < same.log_evidence else again
     return None
 
 
