@@ -10,6 +10,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.refine import verdict
 from hodge_pipeline.refine.guard import Measure, PoseChange, decide
+from hodge_pipeline.refine.path_size import path_size
 from hodge_pipeline.refine.verdict import chi2_measure, first_as_good, spread_corrections
 from hodge_pipeline.scene import KeyFrames
 from hodge_pipeline.types.notes import Note
@@ -139,7 +140,7 @@ def sized(before: np.ndarray, after: np.ndarray, off_images_m: np.ndarray, monke
     monkeypatch.setattr(
         verdict, "_off_images_m", lambda work, firsts, *poses: np.tile(off_images_m[:, None], len(firsts))
     )
-    return verdict._size(work, keys, after), notes
+    return path_size(work, keys, after), notes
 
 
 def test_a_jump_of_the_given_path_is_no_other_scale(monkeypatch: pytest.MonkeyPatch):

@@ -10,6 +10,8 @@ from hodge_pipeline.evaluation.difference import Better, alike, sign_of
 
 SCORE_TOLERANCE = 0.002
 """Least tolerance of a score exp(−d/σ), σ = 69 mm: what 0.14 mm of distance between clouds make."""
+NOISE_SIGMAS = 3.0
+"""Standard errors of a mean difference that count as its noise."""
 Outcome: TypeAlias = Literal["refined", "optimal", "worse", "forced", "convention", "nothing"]
 
 

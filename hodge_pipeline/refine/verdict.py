@@ -14,45 +14,26 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances
-from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.pairs.held_out import held_out_pairs
+from hodge_pipeline.refine.against_images import against_images
 from hodge_pipeline.refine.conventions import explained
-from hodge_pipeline.refine.guard import SCORE_TOLERANCE, Decision, Measure, decide
-from hodge_pipeline.refine.image_steps import MOST_STEPS, step_errors
+from hodge_pipeline.refine.guard import NOISE_SIGMAS, SCORE_TOLERANCE, Decision, Measure, decide
+from hodge_pipeline.refine.path_size import path_size
 from hodge_pipeline.refine.uncertainty import mean_chi2, pose_change
 from hodge_pipeline.rounds.one_round import Work
 from hodge_pipeline.rounds.settling import last_shift_m, settled_m
-from hodge_pipeline.scene import KeyFrames, Round, vertex_ids
+from hodge_pipeline.scene import KeyFrames, Round
 from hodge_pipeline.sources.inspect import guesses
 from hodge_pipeline.stages import Step, Workers
 from hodge_pipeline.types import CloudSet, Floats, Ints, Source, Trajectory
-from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.text import counted, suiting
 
 CHI2_TOLERANCE = 0.02
 """Share by which the mean χ² may grow: the solver minimises a robust cost, not this one."""
-NOISE_SIGMAS = 3.0
-"""Standard errors of a mean difference that count as its noise."""
 KNOTS_APART = (16, 8, 4, 2, 1)
 """Key frames between two knots of the correction: the steps between keep their given shape, which may be better than
 registered ones. The widest spacing that fits the held-out pairs as well as the best is kept."""
-STEP_TOLERANCE, STEP_TOLERANCE_MM = 1.0, 5.0
-"""Share, and millimetres in a room, by which steps may get farther from those of images. Registered steps may be
-rougher than a visual odometry's and yet drift less; steps twice as far off belong to other poses."""
-ROUGHER = 0.1
-"""Share from which on rougher steps are reported."""
-FEWEST_STEPS = 6
-"""Steps that images measure: fewer are not judged."""
-TOLD_SIZE, LARGEST_SIZE = 0.005, 0.1
-"""Share by which a path may grow or shrink before it is reported, and before the result is refused: focal lengths are
-known to a few per cent."""
-SIZE_LEAVES = 0.5
-"""Share of the movement left after scaling, up to which scale explains it: drift bends a path instead."""
-UNLIKE, MOST_JUMPS = 0.5, 3
-"""A step that differs from the refined one by more than half of the longer of the two is no scaled copy of it; jumps
-that a note names.
-"""
 LEAST_JOINED = 0.2
 """Share of the key frames that must overlap with another one, else the given poses are not of these frames."""
 
@@ -100,7 +81,11 @@ def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
     if convention:
         return Decision("forced", convention, decision.measures, moved), after
     if decision.outcome == "refined":  # so far by clouds alone, which a sensor may warp alike in every frame
-        measures += [*_images(work, key_frames, after), *_size(work, key_frames, after), *_settled(work, rounds)]
+        measures += [
+            *against_images(work, key_frames, after),
+            *path_size(work, key_frames, after),
+            *_settled(work, rounds),
+        ]
         decision = decide(measures, moved, force=work.recipe.guard.force)
     return decision, after
 
@@ -186,120 +171,6 @@ def _held_out(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
     work.steps.note(Note("held out", len(pairs), f"{apart}, the correction at every {KNOTS_APART[row - 1]}. key frame"))
     name = "score of held-out edges"
     return found[row - 1], [Measure(name, float(mean[0]), float(mean[1]), "higher", tolerance, is_held_out=True)]
-
-
-def _firsts(key_frames: KeyFrames) -> Ints:
-    """The rows, among the key frames, of those that another one of their sequence follows."""
-    sequence = key_frames.sequence[key_frames.rows]
-    return np.flatnonzero(sequence[1:] == sequence[:-1])
-
-
-def _off_images_m(work: Work, firsts: Ints, before: Floats, after: Floats) -> Floats:
-    """How far (2, S) the steps from these key frames to the next, before and after, lie from those that images show;
-    NaN where there are none.
-    """
-    source, scale = work.scene.source, float(work.recipe.scale)
-    if not len(firsts) or not all(frame.read_colour and frame.read_depth for frame in source.frames):
-        return np.full((2, len(firsts)), np.nan)
-    pairs, poses = np.column_stack([firsts, firsts + 1]), np.stack([before, after])
-    found = work.steps.step(step_errors, source, pairs, poses, scale, title="guard: images", total=len(pairs))
-    return found.off_m
-
-
-def _images(work: Work, key_frames: KeyFrames, after: Floats) -> list[Measure]:
-    """How far steps from key frame to key frame lie from those of optical flow; empty without images or depth."""
-    firsts, scale = _firsts(key_frames), float(work.recipe.scale)
-    firsts = firsts[evenly(len(firsts), MOST_STEPS)]
-    off_m = _off_images_m(work, firsts, key_frames.world_from_key, after)
-    before_mm, after_mm = off_m[:, np.isfinite(off_m).all(axis=0)] * 1000
-    if len(before_mm) < FEWEST_STEPS:
-        return []
-    error_mm = float((after_mm - before_mm).std() / np.sqrt(len(before_mm)))
-    mean = float(before_mm.mean()), float(after_mm.mean())
-    if mean[1] > (1 + ROUGHER) * mean[0] + error_mm:
-        work.steps.note(Note("rougher", detail=f"{mean[1]:.3g} mm off, before {mean[0]:.3g} mm"))
-    tolerance_mm = max(NOISE_SIGMAS * error_mm, STEP_TOLERANCE * mean[0], STEP_TOLERANCE_MM * scale)
-    return [Measure("steps off those of images", *mean, tolerance=tolerance_mm, unit="mm")]
-
-
-def _size(work: Work, key_frames: KeyFrames, after: Floats) -> list[Measure]:
-    """By what share the path (K, 4, 4) became larger or smaller; empty where poses moved mostly in other ways, or a few
-    jumps of the given path hold the difference, which are told.
-    """
-    before = key_frames.world_from_key
-    measures, told = _size_change(work, before, after)
-    jumps, few = _jumps(work, key_frames, after) if measures else (key_frames.rows[:0], 1)
-    for count in range(few, len(jumps) + 1):
-        mended = _size_change(work, _without_steps(before, after, jumps[:count]), after)
-        if not any(measure.is_worse for measure in mended[0]):
-            measures, told = mended[0], [_jump_note(work, before, after, jumps[:count]), *mended[1]]
-            break
-    work.steps.note(*told)
-    return measures
-
-
-def _jump_note(work: Work, before: Floats, after: Floats, jumps: Ints) -> Note:
-    names = vertex_ids(work.scene.source)
-    lengths_m = [np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) for poses in (before, after)]
-    steps = [
-        f"from frame {names[k]} to {names[k + 1]} by {', not '.join(length(m[k]) for m in lengths_m)}" for k in jumps
-    ]
-    more = f"; and {len(steps) - MOST_JUMPS} more" if len(steps) > MOST_JUMPS else ""
-    return Note("given jumps", len(jumps), "; ".join(steps[:MOST_JUMPS]) + more)
-
-
-def _without_steps(before: Floats, after: Floats, jumps: Ints) -> Floats:
-    """The poses (K, 4, 4) before, their steps from the rows `jumps` taken from those after."""
-    out = before.copy()
-    for k in jumps.tolist():
-        out[k + 1 :] = out[k] @ se3.inverse(after[k]) @ after[k + 1] @ se3.inverse(out[k + 1]) @ out[k + 1 :]
-    return out
-
-
-def _jumps(work: Work, key_frames: KeyFrames, after: Floats) -> tuple[Ints, int]:
-    """The rows of key frames from which the given path jumps to the next, the farthest first: steps unlike the refined
-    ones, times the factor of the others, and farther than those from what images show; without images, longer ones.
-    And how many of them are more than half as far as the first.
-
-    None where these are not a minority of the path: then it is another path.
-    """
-    firsts = _firsts(key_frames)
-    steps = [(se3.inverse(poses[firsts]) @ poses[firsts + 1])[:, :3, 3] for poses in (key_frames.world_from_key, after)]
-    lengths = np.linalg.norm(steps, axis=-1)
-    common = lengths.min(axis=0)  # of a jump, and of standing still, next to nothing
-    if not common.sum() > 0:
-        return firsts[:0], 1
-    factor = _weighted_median(lengths[1] / np.maximum(lengths[0], np.finfo(float).tiny), common)
-    off = np.linalg.norm(steps[1] - factor * steps[0], axis=1)
-    unlike = off > UNLIKE * np.maximum(factor * lengths[0], lengths[1])
-    if common[unlike].sum() > UNLIKE * common.sum():
-        return firsts[:0], 1
-    rows, off = firsts[unlike], off[unlike]
-    off_m = _off_images_m(work, rows, key_frames.world_from_key, after)
-    known = np.isfinite(off_m).all(axis=0)
-    jumped = np.where(known, off_m[1] < off_m[0], factor * lengths[0, unlike] > lengths[1, unlike])
-    rows, off = rows[jumped], off[jumped]
-    return rows[np.argsort(-off)], max(int((off > UNLIKE * off.max(initial=0)).sum()), 1)
-
-
-def _weighted_median(values: Floats, weights: Floats) -> float:
-    order = np.argsort(values)
-    share = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(share, share[-1] / 2)])
-
-
-def _size_change(work: Work, before: Floats, after: Floats) -> tuple[list[Measure], list[Note]]:
-    """By what share a path (K, 4, 4) became larger or smaller, and a note; empty where poses moved in other ways."""
-    if len(before) < 3:
-        return [], []
-    spreads = [float(np.linalg.norm(poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0))) for poses in (before, after)]
-    left = [absolute_error(before, after, with_scale=scaled).rmse_m for scaled in (False, True)]
-    factor = spreads[1] / spreads[0] if spreads[0] > 0 else 1.0
-    moved = left[0] * 1000 > STEP_TOLERANCE_MM * float(work.recipe.scale)
-    if not (moved and abs(factor - 1) > TOLD_SIZE and left[1] <= SIZE_LEAVES * left[0]):
-        return [], []
-    told = Note("path scaled", detail=f"{factor:.3g}")
-    return [Measure("change of the path's size", 0.0, abs(factor - 1), tolerance=LARGEST_SIZE)], [told]
 
 
 def _settled(work: Work, rounds: Sequence[Round]) -> list[Measure]:

@@ -1,0 +1,55 @@
+"""Given and refined poses beside the motions that images show: a guard apart from the clouds."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hodge_pipeline.refine.guard import NOISE_SIGMAS, Measure
+from hodge_pipeline.refine.image_steps import MOST_STEPS, step_errors
+from hodge_pipeline.rounds.one_round import Work
+from hodge_pipeline.scene import KeyFrames
+from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types.arrays import evenly
+from hodge_pipeline.types.notes import Note
+
+STEP_TOLERANCE, STEP_TOLERANCE_MM = 1.0, 5.0
+"""Share, and millimetres in a room, by which steps may get farther from those of images. Registered steps may be
+rougher than a visual odometry's and yet drift less; steps twice as far off belong to other poses."""
+ROUGHER = 0.1
+"""Share from which on rougher steps are reported."""
+FEWEST_STEPS = 6
+"""Steps that images measure: fewer are not judged."""
+
+
+def first_of_steps(key_frames: KeyFrames) -> Ints:
+    """The rows, among the key frames, of those that another one of their sequence follows."""
+    sequence = key_frames.sequence[key_frames.rows]
+    return np.flatnonzero(sequence[1:] == sequence[:-1])
+
+
+def off_images_m(work: Work, firsts: Ints, before: Floats, after: Floats) -> Floats:
+    """How far (2, S) the steps from these key frames to the next, before and after, lie from those that images show;
+    NaN where there are none.
+    """
+    source, scale = work.scene.source, float(work.recipe.scale)
+    if not len(firsts) or not all(frame.read_colour and frame.read_depth for frame in source.frames):
+        return np.full((2, len(firsts)), np.nan)
+    pairs, poses = np.column_stack([firsts, firsts + 1]), np.stack([before, after])
+    found = work.steps.step(step_errors, source, pairs, poses, scale, title="guard: images", total=len(pairs))
+    return found.off_m
+
+
+def against_images(work: Work, key_frames: KeyFrames, after: Floats) -> list[Measure]:
+    """How far steps from key frame to key frame lie from those of optical flow; empty without images or depth."""
+    firsts, scale = first_of_steps(key_frames), float(work.recipe.scale)
+    firsts = firsts[evenly(len(firsts), MOST_STEPS)]
+    off_m = off_images_m(work, firsts, key_frames.world_from_key, after)
+    before_mm, after_mm = off_m[:, np.isfinite(off_m).all(axis=0)] * 1000
+    if len(before_mm) < FEWEST_STEPS:
+        return []
+    error_mm = float((after_mm - before_mm).std() / np.sqrt(len(before_mm)))
+    mean = float(before_mm.mean()), float(after_mm.mean())
+    if mean[1] > (1 + ROUGHER) * mean[0] + error_mm:
+        work.steps.note(Note("rougher", detail=f"{mean[1]:.3g} mm off, before {mean[0]:.3g} mm"))
+    tolerance_mm = max(NOISE_SIGMAS * error_mm, STEP_TOLERANCE * mean[0], STEP_TOLERANCE_MM * scale)
+    return [Measure("steps off those of images", *mean, tolerance=tolerance_mm, unit="mm")]
