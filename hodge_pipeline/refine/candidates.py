@@ -245,7 +245,7 @@ def adjusted_model(
     by `move_bodies`, none is merged. Raises `SourceError` where it fails.
     """
     if poses is not None and not move_bodies:
-        return _written(start.moved(poses).adjusted(priors, move_bodies=False), step)
+        return _written(start.moved(poses).adjusted(move_bodies=False), step)
     model = start if poses is None else start.moved(poses).merged()
     adjusted = model.adjusted(priors)
     if poses is not None:
