@@ -11,6 +11,7 @@ from hodge_pipeline.cli.console import ProgressBars, print_table
 from hodge_pipeline.errors import RecipeError, WorkspaceError
 from hodge_pipeline.recipe.recording_options import Level
 from hodge_pipeline.store.workspace import is_run_folder
+from hodge_pipeline.types.input_files import beginning
 
 RRD_MAGIC = b"RR"
 """Recordings begin with RRF2, RRF1, RRF0 or RRIO."""
@@ -64,9 +65,8 @@ def _recording_of(path: Path) -> Path:
     if not path.exists():
         raise WorkspaceError(f"{path}: no recording here, and no run folder: it does not exist")
     if path.is_file():
-        with path.open("rb") as file:
-            if file.read(len(RRD_MAGIC)) != RRD_MAGIC:
-                raise WorkspaceError(f"{path}: no Rerun recording (.rrd): name a run folder, or its recording.rrd")
+        if beginning(path, len(RRD_MAGIC)) != RRD_MAGIC:
+            raise WorkspaceError(f"{path}: no Rerun recording (.rrd): name a run folder, or its recording.rrd")
         return path
     if not (recording := path / "recording.rrd").is_file():
         if not is_run_folder(path):

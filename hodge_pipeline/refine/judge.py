@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.types import Bools, Floats, Ints, ModelQuality
@@ -143,7 +143,7 @@ def mends(before: Cost, after: Cost) -> bool:
     if set(after.images_off) - set(before.images_off):
         return False
     mended, spoilt = int((after.near & ~before.near).sum()), int((before.near & ~after.near).sum())
-    return bool(binom.sf(mended - 1, mended + spoilt, 0.5) < BY_CHANCE)
+    return mended > spoilt and bool(bdtrc(mended - 1, mended + spoilt, 0.5) < BY_CHANCE)
 
 
 def degrees_of_freedom(model: TrackedModel, *, with_poses: bool = True) -> int:
