@@ -137,9 +137,8 @@ def sized(before: np.ndarray, after: np.ndarray, off_images_m: np.ndarray, monke
     )
     rows, zeros, ones = np.arange(len(before)), np.zeros(len(before), np.int64), np.ones(len(before), bool)
     keys = KeyFrames(rows, before, before, zeros, rows / 30, ones, rows / 30, zeros, rows)
-    monkeypatch.setattr(
-        verdict, "_off_images_m", lambda work, firsts, *poses: np.tile(off_images_m[:, None], len(firsts))
-    )
+    off_m = "hodge_pipeline.refine.path_size.off_images_m"
+    monkeypatch.setattr(off_m, lambda work, firsts, *poses: np.tile(off_images_m[:, None], len(firsts)))
     return path_size(work, keys, after), notes
 
 
