@@ -315,7 +315,7 @@ class TrackedModel(Protocol):
         ...
 
     def with_free_intrinsics(self, refine: Literal["focal", "all"]) -> TrackedModel:
-        """The same model, whose adjustments refine focal lengths, or all intrinsics."""
+        """The same model, whose adjustments refine focal lengths, or all intrinsics, as far as tells a gain."""
         ...
 
     @property

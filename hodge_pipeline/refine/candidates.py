@@ -18,7 +18,6 @@ from hodge_pipeline.types import Bools, Floats, PositionPriors, ViewGraph
 
 MODEL = "model"
 GIVEN, POINTS, ADJUSTED = "as given", "bundle adjustment of points alone", "bundle adjustment"
-REPLACED = "points placed anew and bundle adjustment"
 RESECTED = "resection and bundle adjustment"
 ROBUST, ROBUST_POINTS = "resection and robust bundle adjustment", "robust bundle adjustment of points alone"
 AFTER_ROBUST = "bundle adjustment without a robust loss from there"
@@ -99,7 +98,7 @@ class _Candidates:
     def is_settled(self) -> bool:
         """Whether the best is sound, or two that began at other poses reached one optimum that leaves no image off."""
         lowest = self.costs[self.best]
-        rows = [row for row, one in enumerate(self.candidates) if not one.holds_poses and one.name != REPLACED]
+        rows = [row for row, one in enumerate(self.candidates) if not one.holds_poses]
         same = [row for row in rows if self.costs[row].px <= (1 + SAME_COST) * lowest.px]
         return lowest.is_sound or (len(same) > 1 and not lowest.images_off)
 
@@ -142,7 +141,6 @@ def make_candidates(
     found.add(POINTS, start, start.world_from_body, move_bodies=False)
     found.add(ADJUSTED, start)
     if not found.costs[0].is_sound:
-        found.add(REPLACED, start, start.world_from_body)
         poses = steps.step(resected_poses, start, None, title="resection").poses
         found.add(RESECTED, start, poses)
         if not found.costs[found.best].is_sound:

@@ -14,6 +14,8 @@ from hodge_pipeline.types import PositionPriors
 
 Intrinsics: TypeAlias = Literal["none", "focal", "all"]
 """What of each camera is adjusted: nothing; its focal lengths; these, its principal point and its distortion."""
+ROUGH = 1e-3
+"""Relative change of the cost at which a rough adjustment ends: it tells a gain of some per cent."""
 
 
 def adjust(
@@ -25,13 +27,14 @@ def adjust(
     move_bodies: bool = True,
     refine: Intrinsics = "none",
     robust: bool = False,
+    roughly: bool = False,
 ) -> set[int]:
     """Adjust it in place with COLMAP's own options; the points alone where bodies are not to move.
 
     As in COLMAP, observations (image, keypoint) of points `behind` their camera take no part; gives the points whose
     place is therefore not adjusted to their whole track. Without priors the gauge is that of two images; with them the
-    model keeps to theirs. `robust`: with a Cauchy loss of one pixel, for tracks that contradict each
-    other. Raises `SourceError` where the adjustment fails.
+    model keeps to theirs. `robust`: with a Cauchy loss of one pixel, for tracks that contradict each other.
+    `roughly`: to a step that gains less than `ROUGH` of the cost. Raises `SourceError` where the adjustment fails.
     """
     part = pycolmap.Reconstruction(reconstruction)
     loose = {key for key, point in reconstruction.points3D.items() if point.track.length() < 2}
@@ -44,7 +47,10 @@ def adjust(
             part.delete_observation(image_id, column)
     if not part.num_points3D():
         raise SourceError("no point was seen by two images: nothing ties the poses: triangulate points first")
-    _solve(_adjuster(part, bodies, priors, move_bodies, refine, robust))
+    options = _options(refine)
+    if roughly:
+        options.ceres.solver_options.function_tolerance = ROUGH
+    _solve(_adjuster(part, bodies, priors, move_bodies, options, robust))
     for frame_id in bodies.frame_ids:
         reconstruction.frames[frame_id].rig_from_world = part.frames[frame_id].rig_from_world
     for camera_id, camera in part.cameras.items():
@@ -59,10 +65,10 @@ def _adjuster(
     bodies: Bodies,
     priors: PositionPriors | None,
     move_bodies: bool,
-    refine: Intrinsics,
+    options: pycolmap.BundleAdjustmentOptions,
     robust: bool,
 ) -> pycolmap.BundleAdjuster:
-    options, config = _options(refine), pycolmap.BundleAdjustmentConfig()
+    config = pycolmap.BundleAdjustmentConfig()
     for image_id in reconstruction.reg_image_ids():
         config.add_image(image_id)
     if not move_bodies:

@@ -92,6 +92,7 @@ class ColmapModel:
     notes: tuple[str, ...] = ()
     refine: Intrinsics = "none"
     robust: bool = False
+    roughly: bool = False
     known: PriorOptions = field(default_factory=PriorOptions)
     placing: str = ""
     """What gave the model its place in the world, empty where nothing did."""
@@ -270,7 +271,14 @@ class ColmapModel:
         copy = self._copy()
         refine: Intrinsics = self.refine if move_bodies else "none"
         loose = adjust(
-            copy, self._behind(), self.bodies, priors, move_bodies=move_bodies, refine=refine, robust=self.robust
+            copy,
+            self._behind(),
+            self.bodies,
+            priors,
+            move_bodies=move_bodies,
+            refine=refine,
+            robust=self.robust,
+            roughly=self.roughly,
         )
         if loose:
             after = refreshed(self.records, copy)
@@ -286,8 +294,8 @@ class ColmapModel:
         return replace(self, robust=True)
 
     def with_free_intrinsics(self, refine: Literal["focal", "all"]) -> ColmapModel:
-        """The same model, whose adjustments refine focal lengths, or principal points and distortion too."""
-        return replace(self, refine=refine)
+        """The same model, whose adjustments refine focal lengths, or principal points and distortion too, roughly."""
+        return replace(self, refine=refine, roughly=True)
 
     @property
     def moves_intrinsics(self) -> bool:
