@@ -460,6 +460,15 @@ def test_lund_door(data_dir: Path, tmp_path: Path) -> None:
     assert undisturbed.outcome == "optimal", "its poses are without a rig, but for rounding: the size is free"
 
 
+def test_a_principal_point_that_tracks_contradict_is_a_doubt(tmp_path: Path) -> None:
+    """Poses turn to make up for it, and free focal lengths explain little of what is left."""
+    model = pycolmap.Reconstruction(noisy(tmp_path))
+    for camera in model.cameras.values():
+        camera.params = camera.params + np.array([0.0, 40.0, -30.0, 0.0])
+    (result,) = hodge_pipeline.refine_colmap(model, database="none", overrides=FREE).results
+    assert "principal points moved by" in result.decision.doubt and result.decision.doubt.endswith("--refine all")
+
+
 def test_sub_models_are_found(tmp_path: Path) -> None:
     model = noisy(tmp_path)
     for number in ("10", "2"):

@@ -111,8 +111,8 @@ class _Candidates:
         *,
         move_bodies: bool = True,
     ) -> None:
-        """Adjust a model, as a step, from its own poses or from these (B, 4, 4), held without `move_bodies`; a failure
-        becomes a note.
+        """Adjust a model, as a step, from its own poses or from these (B, 4, 4), or its points alone; a failure becomes a
+        note.
         """
         try:
             found = self._steps.step(adjusted_model, model, poses, priors or self._known, move_bodies, title=name)
@@ -138,7 +138,7 @@ def make_candidates(
     Depth takes part only where the model is in metres: without a scale its clouds do not fit the model's unit.
     """
     found, model, first_robust = _Candidates(inputs, start, steps), start, 0
-    found.add(POINTS, start, start.world_from_body, move_bodies=False)
+    found.add(POINTS, start, move_bodies=False)
     found.add(ADJUSTED, start)
     if not found.costs[0].is_sound:
         poses = steps.step(resected_poses, start, None, title="resection").poses
@@ -147,7 +147,7 @@ def make_candidates(
             first_robust = len(found.candidates)
             key, model = steps.key([start, ROBUST]), start.with_robust_loss()
             steps.remember(model, key)
-            found.add(ROBUST_POINTS, model, start.world_from_body, move_bodies=False)
+            found.add(ROBUST_POINTS, model, move_bodies=False)
             found.add(ROBUST, model, poses)
     depth = depth_edges(model, options, steps, workers) if is_metric else no_depth_edges(model)
     solved = None
@@ -239,11 +239,11 @@ def adjusted_model(
 ) -> AdjustedModel:
     """Step: bundle adjustment from the model's own poses, or from these (B, 4, 4) with matched points merged.
 
-    Adjustment brings more matched points together: these are merged after it, and adjusted once more. With poses held,
-    by `move_bodies`, none is merged. Raises `SourceError` where it fails.
+    Adjustment brings more matched points together: these are merged after it, and adjusted once more. Without
+    `move_bodies` its points alone are adjusted, and none is merged. Raises `SourceError` where it fails.
     """
-    if poses is not None and not move_bodies:
-        return _written(start.moved(poses).adjusted(move_bodies=False), step)
+    if not move_bodies:
+        return _written(start.moved(start.world_from_body).adjusted(move_bodies=False), step)
     model = start if poses is None else start.moved(poses).merged()
     adjusted = model.adjusted(priors)
     if poses is not None:

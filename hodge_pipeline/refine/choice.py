@@ -26,8 +26,8 @@ LONG_TRACKS = 3.0
 """Mean images of a point. A point takes 3 of the 2 n numbers of n images: with fewer, poses can fit the rest."""
 LEAST_MOVE, GAIN_TO_MOVE = 1e-3, 0.2
 """Poses that move by more than the first, as a share of the cameras' extent, need the second as a gain: a lens model
-that fits badly moves them by as much and gains a few per cent. It never puts an image off by most of its observations,
-so a candidate that mends such images, and spoils none, needs the least gain: a few images weigh little in a mean."""
+that fits badly moves them by as much and gains a few per cent. It mends no observations without spoiling as many, so a
+candidate that `mends` needs no gain: a few observations weigh little in a mean."""
 MERGE_LOSS = 0.05
 """Share by which the cost may grow where further measurements fit better: merged points leave fewer free parameters."""
 MERGED_MORE = 1.25
