@@ -21,6 +21,8 @@ MAX_NUMBER = 1e100
 ARM_M = 1.0
 """Metres: a rotation counts as the displacement that it causes at this distance, about that of a room's walls."""
 
+OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Between axes of a camera (x right, y down, z ahead) and of OpenGL and Blender (y up, z back): its own inverse."""
 LEAST_PRECISION, MOST_PRECISION = 1e-6, 1e6
 """Of each axis's median, in units in which that is 1: eigenvalues of an information beyond are clipped."""
 

@@ -28,6 +28,7 @@ from hodge_adapters.images.lens_models import (
 from hodge_adapters.json_files import motion, number, objects, read_json, whole, write_json
 from hodge_adapters.posed import trajectory_of, written
 from hodge_adapters.text_rows import first_text, inside, listed, write_bytes_atomically
+from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError, not_written
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Camera, Frame, ImageFile, Source, Trajectory
@@ -37,7 +38,6 @@ from hodge_pipeline.types.text import counted
 FILE = "transforms.json"
 IMAGES = "images"
 ENDINGS = (".png", ".jpg", ".jpeg")
-OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 METRES_PER_UNIT = 1e-3
 
@@ -93,7 +93,7 @@ class NerfstudioReader:
 
     def _frame(self, file: Path, row: int, values: dict[str, Any]) -> Frame:
         where = f"{file}: frame {row}"
-        pose = motion(values.get("transform_matrix"), where) @ OPENGL_FROM_CAM
+        pose = motion(values.get("transform_matrix"), where) @ se3.OPENGL_FROM_CAM
         name = values.get("file_path")
         if not isinstance(name, str) or not name:
             raise SourceError(f"{where}: has no file_path: mend the file")
@@ -166,7 +166,7 @@ def transforms_file(path: Path) -> Path:
 
 def opengl_matrix(world_from_cam: Any) -> list[list[float]]:
     """The rows of a `transform_matrix`."""
-    return (world_from_cam @ OPENGL_FROM_CAM + 0.0).tolist()  # type: ignore[no-any-return]
+    return (world_from_cam @ se3.OPENGL_FROM_CAM + 0.0).tolist()  # type: ignore[no-any-return]
 
 
 def _entry(name: str, world_from_cam: Any, camera: Mapping[str, float] | None) -> dict[str, Any]:

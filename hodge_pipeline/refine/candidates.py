@@ -111,7 +111,7 @@ class _Candidates:
         *,
         move_bodies: bool = True,
     ) -> None:
-        """Adjust a model, as a step, from its own poses or from these (B, 4, 4), or its points alone; a failure becomes a
+        """Adjust a model, as a step, from its own poses or from these (B, 4, 4), or its points alone; a failure is a
         note.
         """
         try:

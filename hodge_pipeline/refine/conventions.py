@@ -20,7 +20,6 @@ SAME_RAD = 1e-6
 TURNED_DEG = 1.0
 """The median turn of edges of a camera that turns: those of one that does not are registered to some tenths."""
 
-OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
 ROBOT_FROM_CAM = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 
 
@@ -45,7 +44,7 @@ READINGS = (
         "write them as qx qy qz qw, or name the columns in the first line: # stamp tx ty tz qw qx qy qz",
     ),
     Reading(
-        lambda poses: np.asarray(poses @ OPENGL_FROM_CAM),
+        lambda poses: np.asarray(poses @ se3.OPENGL_FROM_CAM),
         "poses of OpenGL's or Blender's camera, y up and z back",
         "turn them to a camera with y down and z ahead: world_from_cam @ diag(1, -1, -1, 1)",
     ),
