@@ -1,6 +1,7 @@
 """Where the real data lies: `HODGE_DATA`, else `shared/data` beside the checkout. It is never part of the project.
 
-And what keeps the tests cheap: the longest files begin first, and plots of one kind are drawn once a process.
+And what keeps the tests cheap: the longest files begin first, plots of one kind are drawn once, textures are made once
+a process, and nothing waits for the disk.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import atexit
 import functools
 import gc
+import hashlib
 import io
 import os
 import shutil
@@ -18,6 +20,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import settings
 
@@ -25,6 +28,7 @@ from plugin_metadata import write_metadata
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, which says why
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # or each of many children compiles all that it imports
+gc.disable()  # until all is collected: what is imported stays
 settings.load_profile("ci")  # everywhere the same examples, and none has a deadline
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.append(str(REPOSITORY))  # for benchmarks/, which is no part of the package
@@ -64,9 +68,22 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish() -> None:
     gc.freeze()  # or each collection goes through all that the libraries have left
+    gc.enable()
 
 
-_drawn: dict[tuple[object, ...], bytes] = {}
+def folder_of_all(config: pytest.Config) -> Path:
+    """The base of temporary folders that all workers of this run have in common."""
+    base = config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]
+    return base.parent if hasattr(config, "workerinput") else base
+
+
+@pytest.fixture(scope="session")
+def shared_base(request: pytest.FixtureRequest) -> Path:
+    """The base of temporary folders that all workers of this run have in common: what is put there is made once."""
+    return folder_of_all(request.config)
+
+
+_textures: dict[str, object] = {}
 
 
 @pytest.hookimpl(wrapper=True)  # a fixture would come after those of a module, which make most of the runs
@@ -74,29 +91,50 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """All plots are made; they are drawn in tests that are marked `draws`, and elsewhere the first of a kind.
 
     They are half of what a small run costs, and gaps between the points of pictures, which stay open, a tenth.
+    A run waits for the disk 200 times, which costs a tenth too and tells nothing while the power stays on.
     """
     with pytest.MonkeyPatch.context() as patch:
         if item.get_closest_marker("draws") is None:
             patch.setattr("hodge_pipeline.report.raster._filled", lambda image, *_: image)
-            draw_once(patch)
+            draw_once(patch, folder_of_all(item.config))
+        texture_once(patch)
+        patch.setattr("os.fsync", lambda _: None)
         return (yield)
 
 
-def draw_once(patch: pytest.MonkeyPatch) -> None:
+def draw_once(patch: pytest.MonkeyPatch, folder: Path) -> None:
+    """Keep the first plot of a kind in the folder."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     draw = FigureCanvasAgg.print_png
 
     @functools.wraps(draw)  # matplotlib passes what a signature has
     def print_png(canvas: Any, target: io.BytesIO, **options: Any) -> None:
-        kind = tuple(
+        kind = [
             (axes.get_xlabel(), axes.get_ylabel(), axes.get_xscale(), axes.get_yscale(), axes.has_data())
-            + (len(axes.lines), len(axes.collections), len(axes.patches))
+            + (bool(axes.lines), bool(axes.collections), bool(axes.patches))
             for axes in canvas.figure.axes
-        )
-        if kind not in _drawn:
+        ]
+        kept = folder / f"drawn-{hashlib.sha256(repr(kind).encode()).hexdigest()[:16]}.png"
+        if not kept.exists():
             draw(canvas, new := io.BytesIO(), **options)
-            _drawn[kind] = new.getvalue()
-        target.write(_drawn[kind])
+            (draft := kept.with_suffix(f".{os.getpid()}")).write_bytes(new.getvalue())
+            draft.rename(kept)
+        target.write(kept.read_bytes())
 
     patch.setattr(FigureCanvasAgg, "print_png", print_png)
+
+
+def texture_once(patch: pytest.MonkeyPatch) -> None:
+    """Textures of a demo, which take longer than its few small images."""
+    from hodge_pipeline.demo import room
+
+    make = room.make_textures
+
+    def make_textures(rng: np.random.Generator) -> object:
+        state = str(rng.bit_generator.state)
+        if state not in _textures:
+            _textures[state] = make(rng)
+        return _textures[state]
+
+    patch.setattr(room, "make_textures", make_textures)

@@ -18,13 +18,13 @@ LIGHT = (
 
 
 @pytest.fixture(scope="session")
-def tiny_sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tiny_sequence(shared_base: Path) -> Path:
     """A TUM folder of 24 small noisy frames, going 41 degrees round the room and back; about 1 s of CPU, once."""
-    # A module that imports this fixture gets one of its own, so the folder is shared through the base directory.
-    return make_sequence(tmp_path_factory.getbasetemp() / "tiny_sequence", TINY)
+    # A module that imports this fixture gets one of its own, and so does each worker: the folder is shared by all.
+    return make_sequence(shared_base / "tiny_sequence", TINY)
 
 
 @pytest.fixture(scope="session")
-def short_sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def short_sequence(shared_base: Path) -> Path:
     """A TUM folder of 8 frames of 80x60, for what only has to run: with `LIGHT` a run takes 2 s of CPU."""
-    return make_sequence(tmp_path_factory.getbasetemp() / "short_sequence", SHORT)
+    return make_sequence(shared_base / "short_sequence", SHORT)

@@ -7,9 +7,10 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
-from functools import partial
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -80,30 +81,48 @@ def die_always(number: int) -> int:
 
 
 @contextmanager
-def dask_workers() -> Iterator[Workers]:
-    """Those of a cluster of two, which dies as often as the executor `local` allows."""
+def dask_cluster() -> Iterator[Any]:
+    """One of two workers, in which a block may cost one of them and no more."""
     import dask
     from distributed import LocalCluster
 
     with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 2}),
+        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
         LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
-        cluster_workers(cluster.scheduler_address) as workers,
     ):
+        yield cluster
+
+
+@contextmanager
+def dask_workers() -> Iterator[Workers]:
+    """Those of a cluster of their own."""
+    with dask_cluster() as cluster, cluster_workers(cluster.scheduler_address) as workers:
         yield workers
 
 
-WORKERS: dict[str, Callable[[], AbstractContextManager[Workers]]] = {
-    "in process": LocalExecutor(workers=0).open,
-    "spawned": LocalExecutor(workers=2).open,
-    "dask": dask_workers,
-}
+Opened = Callable[[str], AbstractContextManager[Workers]]
 
 
-@pytest.fixture(params=list(WORKERS))
-def workers(request: pytest.FixtureRequest) -> Iterator[Workers]:
-    with WORKERS[request.param]() as opened:
-        yield opened
+@pytest.fixture(scope="module")
+def opened() -> Iterator[Opened]:
+    """Opens workers by their name; Dask's are those of one cluster, in which nannies replace workers that die."""
+    with ExitStack() as stack:
+
+        @cache
+        def address() -> str:
+            return str(stack.enter_context(dask_cluster()).scheduler_address)
+
+        def open_workers(name: str) -> AbstractContextManager[Workers]:
+            count = {"in process": 0, "spawned": 2}
+            return LocalExecutor(workers=count[name]).open() if name in count else cluster_workers(address())
+
+        yield open_workers
+
+
+@pytest.fixture(params=["in process", "spawned", "dask"])
+def workers(request: pytest.FixtureRequest, opened: Opened) -> Iterator[Workers]:
+    with opened(request.param) as found:
+        yield found
 
 
 def test_every_block_comes_back_once_and_workers_serve_again(workers: Workers) -> None:
@@ -118,16 +137,16 @@ def test_an_error_in_a_task_is_raised_here(workers: Workers) -> None:
 
 
 @pytest.mark.parametrize("name", ["spawned", "dask"])
-def test_a_worker_that_dies_costs_a_retry(name: str, tmp_path: Path) -> None:
-    with WORKERS[name]() as workers:
+def test_a_worker_that_dies_costs_a_retry(name: str, opened: Opened, tmp_path: Path) -> None:
+    with opened(name) as workers:
         results = sorted(workers.map(partial(die_once, tmp_path), range(8)))
     assert results == [(k, k) for k in range(8)]
     assert (tmp_path / "died").exists()
 
 
 @pytest.mark.parametrize(("name", "line"), [("spawned", "block 1 lost its"), ("dask", r"block \d lost its Dask")])
-def test_a_block_that_always_kills_ends_in_one_line(name: str, line: str) -> None:
-    with WORKERS[name]() as workers, pytest.raises(WorkerError, match=line):
+def test_a_block_that_always_kills_ends_in_one_line(name: str, line: str, opened: Opened) -> None:
+    with opened(name) as workers, pytest.raises(WorkerError, match=line):
         list(workers.map(die_always, range(8)))
 
 

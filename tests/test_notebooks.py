@@ -30,6 +30,13 @@ LAST_WORDS = {
     "open3d_script": "mm off",
 }
 """What each notebook must come to."""
+NEW = """
+%reset -f
+%cd {}
+from hodge_pipeline.executors import local
+local._cores = lambda: 0
+"""
+"""As of a new kernel; blocks run in it, since workers that start cost more than what the notebooks compute."""
 
 
 def test_there_is_a_notebook_for_each_user() -> None:
@@ -49,7 +56,7 @@ def kernel() -> Iterator[KernelManager]:
 def test_it_runs_as_it_is(path: Path, kernel: KernelManager, tmp_path: Path) -> None:
     notebook = nbformat.read(path, 4)
     assert not any(cell.get("outputs") for cell in notebook.cells), "kept without outputs"
-    for cells in ([nbformat.v4.new_code_cell(f"%reset -f\n%cd {tmp_path}")], notebook.cells):  # as of a new kernel
+    for cells in ([nbformat.v4.new_code_cell(NEW.format(tmp_path))], notebook.cells):
         notebook.cells = cells
         NotebookClient(notebook, timeout=300, km=kernel).execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
