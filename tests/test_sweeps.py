@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+import pickle
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -20,6 +22,7 @@ from hodge_pipeline.demo.street import Road
 from hodge_pipeline.demo.sweeps import FARTHEST_M, REVOLUTION_S, SpinningScanner
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.trajectory import absolute_error
+from hodge_pipeline.registration import scan_to_map
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.scan_to_map import ScanToMap
 from hodge_pipeline.registration.sweeps import deskewed, deskewed_frame
@@ -41,6 +44,22 @@ def street() -> list[Frame]:
     """Revolutions along a street by their numbers."""
     own = SpinningScanner(Road(SPEED_M_S), 0, beams=16, columns=360, noise=1.0)
     return frames_of([own.sweep(number) for number in range(COUNT)])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def first_velocity_once() -> Iterator[None]:
+    """The first velocity of the same sweeps is found once: it is most of what following so few sweeps costs."""
+    found = dict[str, Floats]()
+
+    def first_velocity(voxel_m: float, sweeps: Sequence[tuple[float, PointCloud]]) -> Floats:
+        given = hashlib.sha256(pickle.dumps((voxel_m, [(at, one.points_in_cam, one.times_s) for at, one in sweeps])))
+        if given.hexdigest() not in found:
+            found[given.hexdigest()] = scan_to_map.first_velocity(voxel_m, sweeps)
+        return found[given.hexdigest()].copy()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hodge_pipeline.start.sweeps.first_velocity", first_velocity)
+        yield
 
 
 def same(cloud: PointCloud) -> PointCloud:
