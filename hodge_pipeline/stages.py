@@ -280,8 +280,8 @@ class TrackedModel(Protocol):
     def measured(self) -> tuple[ViewGraph, tuple[str, ...]]:
         """Relative poses of the bodies, estimated anew from what their images share, and what was left out."""
 
-    def scaled(self, factor: float) -> TrackedModel:
-        """The model in another unit of length."""
+    def scaled(self, factor: float, motion: Floats | None = None) -> TrackedModel:
+        """The model in another unit of length, then moved as a whole by `motion` (4, 4)."""
 
     def placed(self) -> TrackedModel:
         """The model in the world of positions that are known of its images; as it is where none are."""
@@ -314,13 +314,13 @@ class TrackedModel(Protocol):
         """The same model, whose adjustments let an observation that is far off pull little."""
         ...
 
-    def with_free_intrinsics(self, refine: Literal["focal", "all"]) -> TrackedModel:
-        """The same model, whose adjustments refine focal lengths, or all intrinsics, as far as tells a gain."""
+    def with_free(self, refine: Literal["rig", "focal", "all"]) -> TrackedModel:
+        """The same model, whose adjustments refine rigs, focal lengths or all intrinsics, as far as tells a gain."""
         ...
 
     @property
-    def moves_intrinsics(self) -> bool:
-        """Whether that adjusts the cameras' intrinsics too."""
+    def moves_calibration(self) -> bool:
+        """Whether that adjusts the cameras' intrinsics, or their places in rigs, too."""
 
     def standard_errors(self) -> Floats:
         """Standard errors (B, 2) of each body's rotation and position, radians and units."""

@@ -76,8 +76,8 @@ class Model:
         poses: Floats = self._inner.world_from_body
         return poses @ OFF if self._how == "carried" else poses
 
-    def scaled(self, factor: float) -> Any:
-        return self._inner.scaled(1.0 if self._how == "one scale" else factor)
+    def scaled(self, factor: float, motion: Any = None) -> Any:
+        return self._inner.scaled(1.0 if self._how == "one scale" else factor, motion)
 
     def moved(self, poses: Floats) -> Any:
         return self._inner if self._how == "stays" else self._inner.moved(poses)

@@ -7,12 +7,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from hodge_pipeline import se3
 from hodge_pipeline.refine.candidates import CandidateModel, CandidateSet
-from hodge_pipeline.refine.choice import Choice, choose, refused_doubt
+from hodge_pipeline.refine.choice import UNTOLD, Choice, choose, refused_doubt
 from hodge_pipeline.refine.judge import costs
-from hodge_pipeline.refine.model import _loose_doubt, _metric_poses
+from hodge_pipeline.refine.model import _metric_poses
 from hodge_pipeline.refine.uncertainty import loose, told_apart
 from hodge_pipeline.types import Floats, ModelQuality
 from test_refine_judge import flat, quality
@@ -32,7 +33,7 @@ class Model:
     sigmas: tuple[float, ...] = (0.01,) * 10
     body_names = tuple("abcdefghij")
     known_positions = None
-    moves_intrinsics = False
+    moves_calibration = False
 
     @property
     def world_from_body(self) -> Floats:
@@ -61,7 +62,7 @@ def found(before_px: float, after_px: float, points: int = 40, ratio: float = 1.
     ]
     models = [Model(parts[0]), Model(parts[1], moved=0.9, ratio=ratio, sigmas=(sigma,) * 10)]
     inputs, *costly = costs(parts[:1], parts)
-    held_out = SimpleNamespace(held_out=np.zeros((8, 2), np.int64))
+    held_out = SimpleNamespace(held_out=np.zeros((8, 2), np.int64), graph=SimpleNamespace(edge_count=0))
     candidates: Any = [CandidateModel("as given", models[0], holds_poses=True), CandidateModel("bundle", models[1])]
     depth: Any = held_out
     return CandidateSet(inputs, candidates, costly, None, depth, ())
@@ -101,11 +102,13 @@ def test_what_poses_gain_by_fitting_noise_is_no_gain() -> None:
     assert choice.row == 0 and "fitting noise" in choice.reason
 
 
-def test_poses_that_tracks_hardly_fix_are_in_doubt() -> None:
-    for sigma, doubt in ((0.01, ""), (0.5, "in doubt, since tracks hardly fix"), (np.nan, "in doubt")):
-        start, candidate = (one.model for one in found(3.5, 0.6, sigma=sigma).candidates)
-        told = _loose_doubt(start, candidate)
-        assert told.startswith(doubt) and bool(told) == bool(doubt)
+@pytest.mark.parametrize(("sigma", "row"), [(0.01, 1), (0.5, 0), (np.nan, 0)])
+def test_poses_that_tracks_hardly_fix_stay(sigma: float, row: int) -> None:
+    candidates, no_depth = found(3.5, 0.6, sigma=sigma), np.zeros((2, 0))
+    choice = choose(candidates, no_depth, 0, NO_STEPS)
+    assert choice.row == row and (choice.refused == UNTOLD) == (row == 0)
+    told = refused_doubt(candidates, choice, no_depth)
+    assert told == ("" if row else f"in doubt, since bundle fits much better (3.50 → 0.60 px), but {UNTOLD}")
 
 
 def test_one_image_that_tracks_hardly_fix_is_told_and_does_not_keep_the_others_from_better_poses() -> None:

@@ -20,7 +20,7 @@ from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import SourceError, WorkspaceError
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.pairs.edits import listed_edges
-from hodge_pipeline.refine.model import _in_the_scale_of
+from hodge_pipeline.refine.frame import in_frame_of
 from hodge_pipeline.refine.scale import metric_scale
 from hodge_pipeline.types import Floats
 from test_readers_colmap import synthetic
@@ -107,7 +107,10 @@ def test_disturbed_poses_come_back_with_every_rig_name_and_track(tmp_path: Path,
 
 
 def test_one_image_of_many_that_is_off_is_no_optimum(tmp_path: Path) -> None:
-    """It weighs little in the mean of all errors, which keypoints of a pixel's noise make large."""
+    """It weighs little in the mean of all errors, which keypoints of a pixel's noise make large.
+
+    And the others stay where they were, in UTM coordinates too: the world is not drawn along, nor scaled.
+    """
     options = pycolmap.SyntheticDatasetOptions()
     options.num_frames_per_rig, options.num_points3D = 40, 150
     options.camera_params = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1280.0, 1024, 768).params
@@ -116,11 +119,14 @@ def test_one_image_of_many_that_is_off_is_no_optimum(tmp_path: Path) -> None:
     for image in model.images.values():
         for point in image.points2D:
             point.xy = point.xy + rng.normal(scale=1.0, size=2)
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array([5e5, 4e6, 200.0])))
     frame = model.frames[min(model.reg_frame_ids())]
     off = se3.exp([0.05, 0, 0, 0.5, 0, 0]) @ np.vstack([frame.rig_from_world.matrix(), [0, 0, 0, 1]])
     frame.rig_from_world = pycolmap.Rigid3d(np.ascontiguousarray(off[:3]))
     (result,) = hodge_pipeline.refine_colmap(model, database="none", overrides=FREE).results
     assert result.decision.outcome == "refined"
+    moved = (result.model.world_from_body - result.start.world_from_body)[:, :3, 3]
+    assert np.sort(np.linalg.norm(moved, axis=1))[-2] < 0.03 < 10, "cameras lie on a sphere of radius 10"
     assert len(result.candidates[0][1].images_off) == 1 and not result.candidates[result.kept_row][1].images_off
 
 
@@ -196,7 +202,7 @@ def test_positions_that_are_all_one_leave_the_size_as_it_is() -> None:
     one = se3.from_parts(np.broadcast_to(np.eye(3), (4, 3, 3)), np.zeros((4, 3)))
     spread = se3.from_parts(np.broadcast_to(np.eye(3), (4, 3, 3)), np.eye(4)[:, :3])
     start, model = (SimpleNamespace(world_from_body=poses, body_from_cam=one) for poses in (one, spread))
-    assert _in_the_scale_of(start, model) is model  # type: ignore[arg-type]
+    assert in_frame_of(start, model) is model  # type: ignore[arg-type]
 
 
 @pytest.mark.filterwarnings("error:Mean of empty slice")
@@ -499,3 +505,17 @@ def test_intrinsics_are_held_unless_they_are_to_be_refined(tmp_path: Path, refin
     )
     assert ("intrinsics are held: --refine" in notes) == (refine == "none")
     assert ("focal lengths of 2 cameras changed by" in notes) == (refine != "none")
+
+
+def test_a_rig_that_tracks_contradict_is_named_and_refined_where_that_is_asked_for(tmp_path: Path) -> None:
+    """Not the focal lengths, which bend to make up for it."""
+    good = pycolmap.Reconstruction(noisy(tmp_path))
+    turned = pycolmap.Reconstruction(good)
+    (rig,) = turned.rigs.values()
+    (sensor,) = rig.non_ref_sensors
+    rig.set_sensor_from_rig(sensor, pycolmap.Rigid3d(se3.exp([0, 0.03, 0, 0, 0, 0])[:3]) * rig.sensor_from_rig(sensor))
+    (result,) = hodge_pipeline.refine_colmap(turned, database="none", overrides=FREE).results
+    assert "contradict the rig's calibration (cameras turned in their rigs by up to 1.7°" in result.decision.doubt
+    (model,) = ColmapModels(database="none", refine="rig").open_models([turned])
+    found = model.adjusted().native.rigs[rig.rig_id].sensor_from_rig(sensor)
+    np.testing.assert_allclose(found.matrix(), good.rigs[rig.rig_id].sensor_from_rig(sensor).matrix(), atol=5e-3)

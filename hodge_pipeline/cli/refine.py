@@ -93,7 +93,7 @@ def colmap(
     ] = None,
     refine: Annotated[
         str | None,
-        typer.Option("--refine", help="Intrinsics to refine: focal, all, or none (default): held as they are."),
+        typer.Option("--refine", help="Refine focal (lengths), all (intrinsics), rig, or none (default): all held."),
     ] = None,
     force: Force = False,
     recipe: Annotated[str, typer.Option("--recipe", help="A recipe like colmap_refine, by name or file.")] = "",

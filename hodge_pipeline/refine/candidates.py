@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.refine.frame import in_frame_of
 from hodge_pipeline.refine.judge import SAME_COST, Cost, best, costs
 from hodge_pipeline.refine.model_edges import DepthEdges, depth_edges, no_depth_edges
 from hodge_pipeline.refine.model_options import ModelRefinement
@@ -82,7 +83,7 @@ class _Candidates:
     def __init__(self, inputs: Sequence[TrackedModel], start: TrackedModel, steps: Steps) -> None:
         self._inputs, self._steps = [model.quality for model in inputs], steps
         self.candidates, self.notes = [CandidateModel(GIVEN, start, holds_poses=True)], list[str]()
-        self._known = start.known_positions
+        self._start, self._known = start, start.known_positions
         self.update_costs()
 
     def update_costs(self) -> None:
@@ -120,6 +121,8 @@ class _Candidates:
             self.notes.append(f"{name}: {error}")
             return
         adjusted = model.read_back(found.folder, found.notes)
+        if move_bodies and self._known is None:
+            adjusted = in_frame_of(self._start, adjusted)
         self._steps.remember(adjusted, self._steps.key(found))
         self.candidates.append(CandidateModel(name, adjusted, holds_poses=not move_bodies))
         self.update_costs()

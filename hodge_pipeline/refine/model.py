@@ -9,11 +9,11 @@ import numpy as np
 
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.difference import alike
-from hodge_pipeline.evaluation.trajectory import align
 from hodge_pipeline.executors.dask import open_workers
 from hodge_pipeline.refine.candidates import GIVEN, CandidateSet, make_candidates
 from hodge_pipeline.refine.choice import Choice, choose, held_out_score, refused_doubt
 from hodge_pipeline.refine.focal import intrinsics_doubt
+from hodge_pipeline.refine.frame import in_frame_of
 from hodge_pipeline.refine.guard import Decision, Measure, PoseChange
 from hodge_pipeline.refine.judge import SAME_COST, Cost, named
 from hodge_pipeline.refine.model_edges import held_out_distances
@@ -21,7 +21,7 @@ from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_solve import Solved
 from hodge_pipeline.refine.pieces import pieces_doubt
 from hodge_pipeline.refine.scale import Scale, metric_scale
-from hodge_pipeline.refine.uncertainty import SIGMAS, loose, moves, told_apart
+from hodge_pipeline.refine.uncertainty import SIGMAS, loose, moves
 from hodge_pipeline.stages import Steps, TrackedModel, Workers
 from hodge_pipeline.types import Floats
 from hodge_pipeline.types.arrays import rms
@@ -32,8 +32,6 @@ NO_OBSERVATION = (
 ONE_IMAGE = "the model has one image with a pose: nothing tells whether it is right: give a model of two or more"
 JOIN_LOSS = 0.25
 """Share by which the cost may grow when models are joined: each was fitted to its own images alone."""
-NO_BASELINE = 1e-9
-"""Share of the model's size below which a sensor's distance from its rig's origin is rounding."""
 
 
 @dataclass(frozen=True)
@@ -127,12 +125,12 @@ def _refine(
     found = make_candidates(inputs, start, options, steps, workers, is_metric)
     distances_m = held_out_distances(found.depth, _metric_poses(found), workers)
     choice = choose(found, distances_m, options.seed, steps, force=force)
-    at, chosen = choice.row, found.candidates[choice.row].model
+    at, model = choice.row, found.candidates[choice.row].model
     in_world = start.known_positions is not None
-    model = chosen if at == 0 or is_metric or in_world else _in_the_scale_of(start, chosen)
     final = metric_scale(model.seen_depths()) if any(scale.is_observable for scale in scales) else scales[0]
     if final.is_observable and not in_world:
         model, final = model.scaled(final.metres_per_unit), replace(final, metres_per_unit=1.0)
+        model = in_frame_of(start, model, keeps_size=True) if at else model
     change = _change(start, scales[0], model, in_world) if len(inputs) == 1 and at else None
     cost = found.costs[at]
     doubt = (
@@ -155,9 +153,7 @@ def _refine(
 
 
 def _loose_doubt(start: TrackedModel, model: TrackedModel) -> str:
-    """Why a model without metres is in doubt: its poses moved by less than tracks fix them; "" where they do not."""
-    if not told_apart(start, model):
-        return "in doubt, since tracks hardly fix the poses, which moved by less than they leave open"
+    """Why a model without metres is in doubt: tracks fix some of its poses too badly; "" where they do not."""
     names = [str(name) for name, one in zip(model.body_names, loose(start, model), strict=True) if one]
     return f"in doubt, since tracks fix {named(names)} less well than the poses moved" if names else ""
 
@@ -198,15 +194,6 @@ def _join_decision(apart: Cost, joined: Cost, name: str, force: bool) -> Decisio
 
 def _by(candidate: str) -> str:
     return ", with the poses as given" if candidate == GIVEN else f" by {candidate}"
-
-
-def _in_the_scale_of(start: TrackedModel, model: TrackedModel) -> TrackedModel:
-    """The model scaled to the size of the start, which adjustment leaves free unless a rig's baselines fix it."""
-    baselines = np.abs(start.body_from_cam[:, :3, 3]).max()
-    if baselines > NO_BASELINE * np.ptp(start.world_from_body[:, :3, 3], axis=0).max():
-        return model
-    scale = align(model.world_from_body, start.world_from_body, with_scale=True).scale
-    return model.scaled(scale) if scale > 0 else model  # 0: the start's positions are all one
 
 
 def _metric_poses(found: CandidateSet) -> Floats:

@@ -73,6 +73,8 @@ def _is_scaled(case: _Case) -> None:
     after = model.scaled(2.0).world_from_body
     _assert_near(after[:, :3, 3], 2 * before[:, :3, 3], "twice the scale does not double the positions")
     _assert_near(after[:, :3, :3], before[:, :3, :3], "the scale turns bodies")
+    motion = se3.exp(np.full(6, 0.5))
+    _assert_near(model.scaled(1.0, motion).world_from_body, motion @ before, "the whole is not moved by the motion")
     _assert_near(model.world_from_body, before, "scaling a model changes the model itself")
 
 

@@ -1,8 +1,9 @@
-"""Bundle adjustment by pycolmap: poses and points, intrinsics where that is asked for, with rigs as they are."""
+"""Bundle adjustment by pycolmap: poses and points; intrinsics, or the rigs' own poses, where that is asked for."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -12,8 +13,9 @@ from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import PositionPriors
 
-Intrinsics: TypeAlias = Literal["none", "focal", "all"]
-"""What of each camera is adjusted: nothing; its focal lengths; these, its principal point and its distortion."""
+Refine: TypeAlias = Literal["none", "rig", "focal", "all"]
+"""What is adjusted beside poses and points: nothing; where rigs hold their cameras; of each camera its focal lengths;
+these, its principal point and its distortion."""
 ROUGH = 1e-3
 """Relative change of the cost at which a rough adjustment ends: it tells a gain of some per cent."""
 
@@ -25,7 +27,7 @@ def adjust(
     priors: PositionPriors | None,
     *,
     move_bodies: bool = True,
-    refine: Intrinsics = "none",
+    refine: Refine = "none",
     robust: bool = False,
     roughly: bool = False,
 ) -> set[int]:
@@ -50,11 +52,22 @@ def adjust(
     options = _options(refine)
     if roughly:
         options.ceres.solver_options.function_tolerance = ROUGH
+    # far from the origin (UTM) and in large units it would stop early: its tolerances are absolute
+    normal_from_world = part.normalize(fixed_scale=priors is not None)
+    if priors is not None:
+        priors = replace(priors, positions=priors.positions + normal_from_world.translation)
     _solve(_adjuster(part, bodies, priors, move_bodies, options, robust))
-    for frame_id in bodies.frame_ids:
-        reconstruction.frames[frame_id].rig_from_world = part.frames[frame_id].rig_from_world
+    part.transform(normal_from_world.inverse())
+    if move_bodies:
+        for frame_id in bodies.frame_ids:
+            reconstruction.frames[frame_id].rig_from_world = part.frames[frame_id].rig_from_world
     for camera_id, camera in part.cameras.items():
         reconstruction.cameras[camera_id].params = camera.params
+    if refine == "rig":
+        for rig_id, rig in part.rigs.items():
+            for sensor, sensor_from_rig in rig.non_ref_sensors.items():
+                if sensor_from_rig is not None:
+                    reconstruction.rigs[rig_id].set_sensor_from_rig(sensor, sensor_from_rig)
     for key, point in part.points3D.items():
         reconstruction.points3D[key].xyz = point.xyz
     return loose
@@ -87,12 +100,12 @@ def _adjuster(
     return pycolmap.create_pose_prior_bundle_adjuster(options, _prior_options(), config, known, reconstruction)
 
 
-def _options(refine: Intrinsics) -> pycolmap.BundleAdjustmentOptions:
+def _options(refine: Refine) -> pycolmap.BundleAdjustmentOptions:
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    options.refine_focal_length = refine != "none"
+    options.refine_focal_length = refine in ("focal", "all")
     options.refine_principal_point = options.refine_extra_params = refine == "all"
-    options.refine_sensor_from_rig = False
+    options.refine_sensor_from_rig = refine == "rig"
     return options
 
 

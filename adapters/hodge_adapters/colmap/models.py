@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.colmap.bundle import Intrinsics
+from hodge_adapters.colmap.bundle import Refine
 from hodge_adapters.colmap.content import checked_content, read_model
 from hodge_adapters.colmap.database import database_names, has_verified_pairs
 from hodge_adapters.colmap.depth import sensor_depth
@@ -29,6 +29,11 @@ from hodge_pipeline.types import Camera, Frame
 from hodge_pipeline.types.text import counted
 
 HELD = "intrinsics are held: --refine focal or all adjusts them too"
+REFINED = {
+    "rig": "where rigs hold their cameras is refined",
+    "focal": "intrinsics are refined: focal",
+    "all": "intrinsics are refined: all",
+}
 COVISIBILITY = "edges come from the points that images share"
 
 
@@ -50,8 +55,9 @@ class ColmapModels:
     max_edges_per_image: int = Field(
         20, ge=1, description="pairs for an image where there is no database, those with most shared points first"
     )
-    refine: Intrinsics = Field(
-        "none", description="intrinsics that bundle adjustment refines: focal lengths, all with the distortion, or none"
+    refine: Refine = Field(
+        "none",
+        description="refined beside poses: focal lengths, all intrinsics, where a rig holds its cameras, or none",
     )
     positions: str = Field(
         "none",
@@ -111,7 +117,7 @@ class ColmapModels:
         notes = [
             *source.notes,
             *_unposed(reconstruction),
-            HELD if self.refine == "none" else f"intrinsics are refined: {self.refine}",
+            HELD if self.refine == "none" else REFINED[self.refine],
         ]
         frames = {str(frame.frame_id): frame for frame in source.frames}
         depth = self._depth(sensor, frames)

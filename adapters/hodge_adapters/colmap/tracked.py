@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from hodge_adapters.colmap.bodies import Bodies, bodies_of, body_graph
-from hodge_adapters.colmap.bundle import Intrinsics, adjust
+from hodge_adapters.colmap.bundle import Refine, adjust
 from hodge_adapters.colmap.content import content_of, read_reconstruction, refreshed
 from hodge_adapters.colmap.database import database_pairs
 from hodge_adapters.colmap.edges import covisible_pairs, measured_graph
@@ -90,7 +90,7 @@ class ColmapModel:
     text: bool = False
     files: tuple[Path, ...] = ()
     notes: tuple[str, ...] = ()
-    refine: Intrinsics = "none"
+    refine: Refine = "none"
     robust: bool = False
     roughly: bool = False
     known: PriorOptions = field(default_factory=PriorOptions)
@@ -225,10 +225,10 @@ class ColmapModel:
         copy.transform(found.world_from_model)
         return replace(self, reconstruction=copy, files=(), tracks=self.records, placing=found.told)
 
-    def scaled(self, factor: float) -> ColmapModel:
-        """Positions times the factor."""
-        copy = self._copy()
-        copy.transform(pycolmap.Sim3d(factor, pycolmap.Rotation3d(), np.zeros(3)))
+    def scaled(self, factor: float, motion: Floats | None = None) -> ColmapModel:
+        """Positions times the factor, then the whole moved by `motion` (4, 4)."""
+        copy, moved = self._copy(), np.eye(4) if motion is None else motion
+        copy.transform(pycolmap.Sim3d(factor, pycolmap.Rotation3d(moved[:3, :3]), moved[:3, 3]))
         return replace(self, reconstruction=copy, files=(), tracks=self.records)
 
     def moved(self, world_from_body: Floats) -> ColmapModel:
@@ -269,7 +269,7 @@ class ColmapModel:
 
     def _adjusted(self, priors: PositionPriors | None, move_bodies: bool) -> ColmapModel:
         copy = self._copy()
-        refine: Intrinsics = self.refine if move_bodies else "none"
+        refine: Refine = self.refine if move_bodies else "none"
         loose = adjust(
             copy,
             self._behind(),
@@ -293,12 +293,12 @@ class ColmapModel:
         """The same model, whose adjustments let an observation that is far off pull little."""
         return replace(self, robust=True)
 
-    def with_free_intrinsics(self, refine: Literal["focal", "all"]) -> ColmapModel:
-        """The same model, whose adjustments refine focal lengths, or principal points and distortion too, roughly."""
+    def with_free(self, refine: Literal["rig", "focal", "all"]) -> ColmapModel:
+        """The same model, whose adjustments refine rigs, focal lengths, or all intrinsics, roughly."""
         return replace(self, refine=refine, roughly=True)
 
     @property
-    def moves_intrinsics(self) -> bool:
+    def moves_calibration(self) -> bool:
         """Whether bundle adjustment changes more than poses and points."""
         return self.refine != "none"
 
@@ -339,9 +339,11 @@ class ColmapModel:
         return replace(self, reconstruction=back, files=(), notes=(*notes, *self._refined_cameras(back)), tracks=None)
 
     def _refined_cameras(self, after: pycolmap.Reconstruction) -> tuple[str, ...]:
-        """Lines on how the adjustment to another model changed focal lengths and principal points."""
-        if not self.moves_intrinsics:
+        """Lines on how the adjustment to another model changed rigs, focal lengths and principal points."""
+        if not self.moves_calibration:
             return ()
+        if self.refine == "rig":
+            return self._refined_rigs(after)
         cameras = self.reconstruction.cameras
         pairs = [(cameras[key].mean_focal_length(), new.mean_focal_length()) for key, new in after.cameras.items()]
         ratios: Floats = np.array([new / old for old, new in pairs])
@@ -356,6 +358,21 @@ class ColmapModel:
             ]
             told += [f"principal points moved by {np.median(shift):.3g} px"]
         return tuple(told)
+
+    def _refined_rigs(self, after: pycolmap.Reconstruction) -> tuple[str, ...]:
+        """A line on how far cameras turned in their rigs, and moved as a share of their distance from its origin."""
+        turns, shifts, distances = list[float](), list[float](), list[float]()
+        for rig_id, rig in self.reconstruction.rigs.items():
+            for sensor, before in rig.non_ref_sensors.items():
+                if before is not None:
+                    moved = after.rigs[rig_id].non_ref_sensors[sensor] * before.inverse()
+                    turns.append(float(np.degrees(moved.rotation.angle())))
+                    shifts.append(float(np.linalg.norm(moved.translation)))
+                    distances.append(float(np.linalg.norm(before.translation)))
+        if not turns:
+            return ()
+        told = f"cameras turned in their rigs by up to {max(turns):.2g}°"
+        return (f"{told} and moved by up to {max(shifts) / max([*distances, 1e-300]):.0%} of the rig",)
 
     def _copy(self) -> pycolmap.Reconstruction:
         return pycolmap.Reconstruction(self.reconstruction)
