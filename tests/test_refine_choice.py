@@ -102,9 +102,14 @@ def test_what_poses_gain_by_fitting_noise_is_no_gain() -> None:
     assert choice.row == 0 and "fitting noise" in choice.reason
 
 
-@pytest.mark.parametrize(("sigma", "row"), [(0.01, 1), (0.5, 0), (np.nan, 0)])
-def test_poses_that_tracks_hardly_fix_stay(sigma: float, row: int) -> None:
+@pytest.mark.parametrize(
+    ("sigma", "nearer", "row"), [(0.01, 1.1, 1), (0.01, 100.0, 0), (0.5, 1.0, 0), (np.nan, 1.0, 0)]
+)
+def test_poses_that_tracks_hardly_fix_stay(sigma: float, nearer: float, row: int) -> None:
+    """As where adjustment makes points at infinity near ones, which then seem to fix poses well."""
     candidates, no_depth = found(3.5, 0.6, sigma=sigma), np.zeros((2, 0))
+    given: Any = candidates.candidates[0].model
+    given.quality = replace(given.quality, parallaxes_deg=given.quality.parallaxes_deg / nearer)
     choice = choose(candidates, no_depth, 0, NO_STEPS)
     assert choice.row == row and (choice.refused == UNTOLD) == (row == 0)
     told = refused_doubt(candidates, choice, no_depth)

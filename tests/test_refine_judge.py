@@ -13,7 +13,7 @@ import hodge_pipeline
 from hodge_adapters.colmap.models import ColmapModels
 from hodge_adapters.colmap.uncertainty import standard_errors
 from hodge_pipeline import se3
-from hodge_pipeline.refine.judge import best, costs, mends
+from hodge_pipeline.refine.judge import best, costs, mends, spoilt_doubt
 from hodge_pipeline.types import ModelQuality
 from test_refine_colmap import FREE, noisy
 
@@ -127,6 +127,16 @@ def test_an_observation_of_two_models_counts_once() -> None:
     assert (apart.observations, apart.px, joined.px) == (2, pytest.approx(2.0), pytest.approx(1.0))
 
 
+def test_what_fits_better_but_spoils_what_fitted_is_in_doubt() -> None:
+    """As a facade laid on its copy: most observations agree, those that show the difference do not."""
+    names = [f"image {row}" for row in range(10)]
+    before = flat(0.5, images=10, count=10) | {(name, 0): 60.0 for name in names}
+    found = [flat(0.5, images=10, count=10) | {(name, 1): 60.0 for name in names[:count]} for count in (5, 6)]
+    _, given, fit, spoils = costs([quality(before)], [quality(before), *map(quality, found)])
+    assert fit.px < given.px and spoils.px < given.px
+    assert not spoilt_doubt(given, fit) and spoilt_doubt(given, spoils).startswith("in doubt, since 6% of the obs")
+
+
 def test_errors_are_those_of_pycolmap(tmp_path: Path) -> None:
     (model,) = ColmapModels(database="none", images="none").open_models(noisy(tmp_path))
     theirs = pycolmap.Reconstruction(tmp_path / "model")
@@ -148,6 +158,21 @@ def test_one_point_near_the_plane_of_a_camera_does_not_make_every_pose_uncertain
         for model in (ColmapModels(database="none", images="none").open_models([one])[0] for one in (right, wrong))
     )
     np.testing.assert_allclose(unsure, sure, rtol=0.05)
+
+
+def test_a_body_that_sees_nothing_does_not_make_the_others_uncertain(tmp_path: Path) -> None:
+    full = pycolmap.Reconstruction(noisy(tmp_path))
+    blind = pycolmap.Reconstruction(full)
+    frame_id = min(blind.reg_frame_ids())
+    for data in blind.frames[frame_id].image_ids:
+        for column, seen in enumerate(blind.images[data.id].points2D):
+            if seen.has_point3D():
+                blind.delete_observation(data.id, column)
+    models = [ColmapModels(database="none", images="none").open_models([one])[0] for one in (full, blind)]
+    sure, unsure = (standard_errors(model.records, model.bodies) for model in models)
+    unseen = np.array(models[1].bodies.frame_ids) == frame_id
+    assert np.isnan(unsure[unseen]).all()
+    assert (unsure[~unseen] < 1.5 * sure[~unseen]).all()
 
 
 def test_no_number_of_a_refinement_is_that_of_a_point_behind_a_camera(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ MERGE_LOSS = 0.05
 MERGED_MORE = 1.25
 """Times the points that merge at the input's own poses: a candidate that merges more shows that matches contradict
 these poses."""
-UNTOLD = "tracks fix poses less well than it moves them"
+UNTOLD = "tracks fix the poses less well than the best candidate moves them"
 """Why a candidate is refused whose poses move by less than its tracks leave open: what was given may be nearer to the
 truth, as of 24 images and 120 points in two of them each: 1.8 to 4.6 % off, while the error falls to 0.03 px."""
 OBSERVATIONS_HELD_OUT = 0.1
@@ -160,7 +160,7 @@ def _reason_to_keep(found: CandidateSet, at: int, seed: int, steps: Steps) -> st
     moves = not found.candidates[at].holds_poses
     poses_alone = moves and not start.moves_calibration
     by_tracks = start.known_positions is None and not found.depth.graph.edge_count
-    if poses_alone and by_tracks and not told_apart(start, model):
+    if poses_alone and by_tracks and not told_apart(found.candidates[0].model, model):
         return UNTOLD
     if is_mended:
         return ""

@@ -146,6 +146,18 @@ def mends(before: Cost, after: Cost) -> bool:
     return mended > spoilt and bool(bdtrc(mended - 1, mended + spoilt, 0.5) < BY_CHANCE)
 
 
+def spoilt_doubt(before: Cost, after: Cost) -> str:
+    """Why a candidate of lower cost may be wrong: it takes more observations beyond the cap than sound models have
+    there, as where half of a scene is laid on a copy of itself; "" where it does not. Both of the same `costs`.
+    """
+    share = float((before.near & ~after.near).mean()) if len(before.near) else 0.0
+    if share <= SOUND_SHARE:
+        return ""
+    return (
+        f"in doubt, since {share:.0%} of the observations, which fit the input, are more than {after.cap_px:.3g} px off"
+    )
+
+
 def degrees_of_freedom(model: TrackedModel, *, with_poses: bool = True) -> int:
     """The numbers observed less the parameters of the points and, `with_poses`, of the bodies' poses."""
     poses = POSE_PARAMETERS * len(model.body_names) if with_poses else 0

@@ -15,7 +15,7 @@ from hodge_pipeline.refine.choice import Choice, choose, held_out_score, refused
 from hodge_pipeline.refine.focal import intrinsics_doubt
 from hodge_pipeline.refine.frame import in_frame_of
 from hodge_pipeline.refine.guard import Decision, Measure, PoseChange
-from hodge_pipeline.refine.judge import SAME_COST, Cost, named
+from hodge_pipeline.refine.judge import SAME_COST, Cost, named, spoilt_doubt
 from hodge_pipeline.refine.model_edges import held_out_distances
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_solve import Solved
@@ -137,6 +137,7 @@ def _refine(
         intrinsics_doubt(found, steps)
         or cost.doubt
         or cost.images_doubt
+        or spoilt_doubt(found.costs[0], cost)
         or refused_doubt(found, choice, distances_m)
         or ("" if found.depth.graph.edge_count or in_world else pieces_doubt(model))
     )

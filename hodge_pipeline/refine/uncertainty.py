@@ -58,11 +58,17 @@ def moves(before: Floats, after: Floats) -> Floats:
 def told_apart(start: TrackedModel, model: TrackedModel) -> bool:
     """Whether the model, of the start's size, moved by more than its uncertainty, in the mean or the median.
 
-    A model that moved by less may be farther from the truth than the start: both errors add up to the move.
+    A model that moved by less may be farther from the truth than the start: both errors add up to the move. What the
+    model has more parallax than the start, in the median, does not count: of points at infinity an adjustment may make
+    near ones, which seem to fix poses well. Bodies that tracks do not fix take no part.
     """
     moved, known = _moved_and_known(start, model)
+    before, after = (float(np.median(one.quality.parallaxes_deg)) for one in (start, model))
+    known = known * max(1.0, after / max(before, np.finfo(float).tiny))
+    fixed = np.isfinite(known).all(axis=1)
+    moved, known = moved[fixed], known[fixed]
     total = (moved**2).sum(axis=0) > SIGMAS**2 * (known**2).sum(axis=0)
-    return bool((total | (np.median(moved / known, axis=0) > SIGMAS)).any())
+    return bool(fixed.any()) and bool((total | (np.median(moved / known, axis=0) > SIGMAS)).any())
 
 
 def loose(start: TrackedModel, model: TrackedModel) -> Bools:

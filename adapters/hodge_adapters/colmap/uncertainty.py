@@ -11,13 +11,15 @@ from hodge_adapters.colmap.cameras import colmap_camera
 from hodge_adapters.colmap.points import error_cap
 from hodge_adapters.colmap.records import Model
 from hodge_pipeline import se3
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types import Bools, Floats, Ints
 
 GAUGE = 7
 """Turn, shift and size of the whole, which no track tells."""
 MOST_BODIES_JOINTLY = 300
 """Above it the joint covariance (6 B)² costs too much: each body is then taken given all others, which is too sure."""
 STEP = 1e-6
+LEAST_SEEN = 3
+"""Observations that fix a pose."""
 
 
 @dataclass(frozen=True)
@@ -30,19 +32,28 @@ class _Rows:
     body: Ints
     point: Ints
 
+    def of(self, seen: Bools) -> _Rows:
+        """The rows of these bodies (B,), which are then numbered without the others."""
+        at = seen[self.body]
+        body = (np.cumsum(seen) - 1)[self.body[at]]
+        return _Rows(self.residual[at], self.by_body[at], self.by_point[at], body, self.point[at])
+
 
 def standard_errors(model: Model, bodies: Bodies) -> Floats:
     """Standard errors (B, 2) of each body's rotation (rad) and position (units): roots of the mean variance of 3 axes.
 
     From the size of the residuals, wrong observations left out (see `error_cap`); in the gauge in which the bodies as a
-    whole stay where they are. NaN without tracks.
+    whole stay where they are. NaN without tracks, and of a body with fewer than `LEAST_SEEN` observations, which takes
+    no part: what is free beside the gauge would be mistaken for it.
     """
     rows = _rows(model, bodies)
-    count = len(bodies.frame_ids)
+    out = np.full((len(bodies.frame_ids), 2), np.nan)
+    seen = np.bincount(rows.body, minlength=len(out)) >= LEAST_SEEN
+    rows, count = rows.of(seen), int(seen.sum())
     points = np.unique(rows.point)
     freedom = rows.residual.size - 6 * count - 3 * len(points) + GAUGE
     if freedom <= 0 or not len(points):
-        return np.full((count, 2), np.nan)
+        return out
     variance = float((rows.residual**2).sum()) / freedom
     schur = _schur(rows, count, joint=count <= MOST_BODIES_JOINTLY)
     if count <= MOST_BODIES_JOINTLY:
@@ -50,7 +61,8 @@ def standard_errors(model: Model, bodies: Bodies) -> Floats:
     else:
         blocks = np.asarray(np.linalg.pinv(schur, hermitian=True), np.float64)
     variances = variance * np.diagonal(blocks, axis1=1, axis2=2).reshape(count, 2, 3).mean(axis=2)
-    return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
+    out[seen] = np.sqrt(np.maximum(variances, 0.0))
+    return out
 
 
 def _schur(rows: _Rows, count: int, joint: bool) -> Floats:
