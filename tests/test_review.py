@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from hodge_adapters.pose_graphs.g2o import write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError, WorkspaceError
 from hodge_pipeline.pairs.edits import Edit, History, pair_names, read_history_file, write_history_file
+from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.review import session as review_session
 from hodge_pipeline.review.adding import Candidate, guess_from_points
 from hodge_pipeline.review.decisions import LockedError, StaleError
 from hodge_pipeline.review.front import Front
@@ -29,6 +32,7 @@ from hodge_pipeline.review.settle import Settler, moved_m
 from hodge_pipeline.review.subject import open_for_review
 from hodge_pipeline.rounds.one_round import with_right
 from hodge_pipeline.solvers.editing import GraphEditor
+from hodge_pipeline.types import CloudSet
 
 VIEWS, REACH, PLANTED = 24, 3, (5, 40)
 """A ring of views, each joined to the next three; two of these edges have another motion."""
@@ -335,6 +339,11 @@ def test_two_pages_and_a_stale_write_through_the_front(client: Client) -> None:
         ("POST", "decide", {"verb": "disable", "rows": [1]}),
         ("POST", "decide", ["disable"]),
         ("POST", "look", {"mode": "sideways"}),
+        ("POST", "look", {"share": "half"}),
+        ("POST", "look", {"share": float("nan")}),
+        ("POST", "look", {"cut": [1]}),
+        ("POST", "look", {"verdicts": 3}),
+        ("POST", "select", {"row": float("inf")}),
         ("POST", "select", {"row": 10_000}),
         ("POST", "pick", {"frames": ["nobody"]}),
         ("POST", "register", {}),
@@ -388,3 +397,33 @@ def test_an_edge_added_counts_until_it_is_undone(session: Session) -> None:
     session.undo(revision(session))
     session.wait()
     assert session.settled.weights[count] == 0
+
+
+def test_what_was_added_before_and_what_a_page_adds_meanwhile_are_registered_once_each(
+    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    poses, asked, gate = poses_on_a_ring(VIEWS), list[tuple[int, int]](), Event()
+    motion = se3.inverse(poses[0]) @ poses[12]
+    registration = hodge_pipeline.Registration(motion, np.eye(6) * 1e4, 0.8, 0.01, 500, 9, True)
+
+    def register(_recipe: Any, _clouds: Any, wanted: Candidate) -> hodge_pipeline.Registration:
+        asked.append((wanted.i, wanted.j))
+        return registration
+
+    monkeypatch.setattr(review_session, "register_candidate", register)
+    recipe, clouds = load_recipe("demo", [], tmp_path), CloudSet.from_clouds([])
+    run = replace(session.subject, path=tmp_path, recipe=recipe, clouds=clouds)
+    before = Edit(register=("0-12",), guesses=(("0-12", tuple(motion.reshape(-1).tolist())),))
+    write_history_file(run.edits, History((before,)))
+    monkeypatch.setattr(review_session, "open_for_review", lambda _: run)
+    for jobs in (session.slow, session.quick):  # as while a run is fused
+        jobs.put("fusing", lambda: gate.wait() and None)
+    session.reopen(tmp_path)
+    session.candidate = Candidate(1, 13, motion, found=registration)
+    session.accept(revision(session))
+    session.candidate = Candidate(2, 14, motion)
+    session.register()
+    gate.set()
+    session.wait()
+    assert asked == [(0, 12), (2, 14)]
+    assert [len(session.rows_of(pair)) for pair in ("0-12", "1-13")] == [1, 1]

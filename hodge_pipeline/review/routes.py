@@ -21,7 +21,7 @@ from hodge_pipeline.report.edge_pictures import edge_pictures
 from hodge_pipeline.review.front import Answer, Route, Site
 from hodge_pipeline.review.keeping import save
 from hodge_pipeline.review.listing import Query, describe, list_edges, state
-from hodge_pipeline.review.session import MODES, Session
+from hodge_pipeline.review.session import ALL_VERDICTS, MODES, Session
 from hodge_pipeline.rounds.suggestions import suggest_pairs
 from hodge_pipeline.stages import Advance
 from hodge_pipeline.types.input_files import read_input
@@ -176,8 +176,19 @@ def _whole(asked: Asked, key: str) -> int:
     """The whole number of this name. Raises `GraphError` where it is none."""
     try:
         return int(asked[key])
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise GraphError(f"{key}: expected a whole number, got {asked.get(key)!r}") from None
+
+
+def _number(asked: Asked, key: str) -> float:
+    """The finite number of this name. Raises `GraphError` where it is none."""
+    try:
+        value = float(asked[key])
+    except (TypeError, ValueError, OverflowError):
+        value = np.nan
+    if not np.isfinite(value):
+        raise GraphError(f"{key}: expected a number, got {asked[key]!r}")
+    return value
 
 
 def _rows(asked: Asked) -> list[int]:
@@ -202,17 +213,19 @@ def _query(asked: Asked) -> Query:
 
 
 def _look(asked: Asked) -> dict[str, Any]:
-    """The changes of `session.Look` that a request asks for. Raises `GraphError` for an unknown mode."""
+    """The changes of `session.Look` that a request asks for. Raises `GraphError` for values that make no sense."""
     changes: dict[str, Any] = {}
     if "mode" in asked:
         if asked["mode"] not in MODES:
             raise GraphError(f"mode: expected {', '.join(MODES)}")
         changes["mode"] = asked["mode"]
     if "share" in asked:
-        changes["share"] = float(np.clip(float(asked["share"]), 0.0, 1.0))
+        changes["share"] = min(max(_number(asked, "share"), 0.0), 1.0)
     if "cut" in asked:
-        changes["cut"] = None if asked["cut"] is None else float(asked["cut"])
+        changes["cut"] = None if asked["cut"] is None else _number(asked, "cut")
     if "verdicts" in asked:
+        if not isinstance(asked["verdicts"], list):
+            raise GraphError(f"verdicts: expected a list of {', '.join(ALL_VERDICTS)}")
         changes["verdicts"] = tuple(map(str, asked["verdicts"]))
     return changes
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import getpass
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -96,7 +96,10 @@ class Session:
         self.first = self.settled
         if ((self.table.weights(self.decisions.history) > 0) != (self.settled.weights > 0)).any():
             self.quick.put("solving", self._solve)
-        self.slow.put("registering", self._register_missing)
+        # Now, before a page can add pairs of its own, and under another name than what a page has registered.
+        history = self.decisions.history
+        missing = {pair: history.guesses[pair] for pair in self.missing() if pair in history.guesses}
+        self.slow.put("registering what was added before", partial(self._register_missing, missing))
         self.slow.put("judging", self._judge)
 
     def close(self) -> None:
@@ -238,14 +241,14 @@ class Session:
                 self.table = replace(table, edges=judged.edges)
             self.bump()
 
-    def _register_missing(self) -> None:
-        """Register the pairs that an earlier review added and no run has solved: only their motions were stored."""
-        recipe, clouds, guesses = self.subject.recipe, self.subject.clouds, self.decisions.history.guesses
-        pairs = [pair for pair in self.decisions.history.registered if pair in guesses and not self.rows_of(pair)]
-        if recipe is None or clouds is None or not pairs:
+    def _register_missing(self, guesses: Mapping[str, Floats]) -> None:
+        """Register pairs that an earlier review added and no run has solved: only their motions were stored."""
+        recipe, clouds = self.subject.recipe, self.subject.clouds
+        if recipe is None or clouds is None or not guesses:
             return
-        for pair, (i, j) in zip(pairs, vertex_rows(self.table.graph.vertex_ids, pairs).tolist(), strict=True):
-            wanted = Candidate(i, j, guesses[pair])
+        rows = vertex_rows(self.table.graph.vertex_ids, list(guesses)).tolist()
+        for guess, (i, j) in zip(guesses.values(), rows, strict=True):
+            wanted = Candidate(i, j, guess)
             found = register_candidate(recipe, clouds, wanted)
             with self.changed:
                 self._adding.append(replace(wanted, found=found))
