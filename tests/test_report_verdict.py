@@ -145,10 +145,10 @@ def test_pieces_come_first_in_the_headline(
 def test_a_path_in_doubt_says_so_first(report: Report) -> None:
     """Whatever fits better: clouds of an object that was followed fit each other."""
     verdict = judge(replace(report, notes=(Note("camera or object", 9, "20 frames, 1–9"),)))
-    assert verdict.headline == "In doubt, since much of the image moves: improved against odometry"
+    assert verdict.headline == "In doubt, since images contradict the camera's motion: improved against odometry"
     doubts = (*report.notes, Note("camera or object", 10, "1–9, 12"), Note("depth unit", detail="its steps"))
     headline = judge(replace(report, notes=doubts)).headline
-    reasons = "depth is probably not in metres and much of the image moves"
+    reasons = "depth is probably not in metres and images contradict the camera's motion"
     assert headline == f"In doubt, since {reasons}: improved against odometry"
     assert verdict.mark == "mixed"
     doubt = Note("reader's doubt", detail="a camera of focal length 525 is assumed")

@@ -458,6 +458,16 @@ def test_a_recording_that_stops_for_an_hour_goes_on_where_the_camera_stayed(
     assert np.abs(poses - expected).max() < 0.06
 
 
+def test_a_cut_in_a_recording_whose_stamps_go_on_joins_nothing(sequence: Path, tmp_path: Path) -> None:
+    """Clouds of 45 degrees apart fit somewhere, metres off; flow from there finds nothing."""
+    source, rows = TumReader().open(sequence), (3, 4, 28, 29)
+    frames = [replace(source.frames[row], stamp_s=source.frames[place].stamp_s) for place, row in enumerate(rows)]
+    found, notes = track(replace(source, frames=tuple(frames)), tmp_path / "cut")
+    is_behind = found.key_rows >= 2
+    assert is_behind.any() and not np.diff(is_behind[found.steps.pairs], axis=1).any()
+    assert any("tracking was lost" in note for note in notes)
+
+
 def test_a_clock_that_goes_back_is_said_and_costs_no_frame(sequence: Path, whole: Tracked, tmp_path: Path) -> None:
     source = TumReader().open(sequence)
     frames = [replace(frame, stamp_s=frame.stamp_s - 5.0 * (row >= 30)) for row, frame in enumerate(source.frames)]

@@ -1,9 +1,9 @@
 """Long sequences: each frame is followed from the last key frame by optical flow, and key frames alone are kept.
 
 A frame becomes a key frame where the camera has moved far enough from the last one, or sees too little of what that
-saw. Where flow finds no motion, as without texture, the frame's cloud is registered to the key frame's instead. The
-sequence is cut into blocks that are tracked side by side, so nothing depends on how many workers there are, and memory
-holds one block a worker, never the sequence.
+saw. Where flow finds no motion, as without texture, the frame's cloud is registered to the key frame's instead, and
+flow tries again from there. The sequence is cut into blocks that are tracked side by side, so nothing depends on how
+many workers there are, and memory holds one block a worker, never the sequence.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.registration.clouds import CloudOptions, cloud_or_note, is_blank
 from hodge_pipeline.registration.flow import Corners, FlowImage, Followed, find_corners, flow_image, follow
 from hodge_pipeline.registration.moving import AT_REST, Moments, contradicting, misplaced, rival_motion
-from hodge_pipeline.registration.odometry import OdometryOptions
+from hodge_pipeline.registration.odometry import SURE_FITNESS, OdometryOptions
 from hodge_pipeline.registration.sightings import Sightings
 from hodge_pipeline.registration.tracked_blocks import TrackedBlock
 from hodge_pipeline.registry import plugin_errors
@@ -121,6 +121,11 @@ class _View:
     def corners(self) -> Corners | None:
         """What flow follows from this frame."""
         return None if self.image is None else find_corners(self.image)
+
+    @property
+    def can_be_followed(self) -> bool:
+        """Whether it shows enough for flow."""
+        return self.corners is not None and len(self.corners) >= FEWEST_FOLLOWED
 
     @cached_property
     def cloud_and_note(self) -> tuple[PointCloud, str]:
@@ -237,6 +242,7 @@ class _Tracker:
         self._rows[view.place] = (view.place, np.eye(4), 1.0)
         self._last, self._key_from_last = view, np.eye(4)
         self._missed: _View | None = None
+        self._is_cut = False
 
     def _keep_cloud(self, key: _View) -> None:
         """All that is kept of a key frame that nothing follows any more; of the first, the block before keeps it."""
@@ -260,7 +266,7 @@ class _Tracker:
         seconds = self._duration(self._last.place, view.place)
         view.twist = self._velocity = se3.log(se3.inverse(self._key_from_last) @ found.i_from_j) / seconds
         self._rows[view.place] = (self._keys[-1].place, found.i_from_j, found.fitness)
-        self._last, self._key_from_last, self._missed = view, found.i_from_j, None
+        self._last, self._key_from_last, self._missed, self._is_cut = view, found.i_from_j, None, False
         has_left = self._has_moved(found.i_from_j) or self._sees_little(view)
         if is_last or (has_left and len(view.cloud)):  # a key frame without depth is joined to nothing
             self._promote(view, found)
@@ -335,7 +341,7 @@ class _Tracker:
 
     def _registered_by_clouds(self, view: _View) -> Registration:
         """The motion by the registrar of odometry."""
-        found = self._registered(self._keys[-1], view, self._key_from_last)
+        found = self._confirmed(self._keys[-1], view, self._registered(self._keys[-1], view, self._key_from_last))
         if found.fitness < self._options.kept_fitness and self._last.place != self._keys[-1].place:
             found = self._from_last(view, found)
         if not self._is_good(found) and self._missed is not None:
@@ -344,7 +350,7 @@ class _Tracker:
 
     def _from_last(self, view: _View, to_key: Registration) -> Registration:
         """The view seen from the last frame tracked, which becomes a key frame, where these two share more."""
-        found = self._registered(self._last, view, np.eye(4))
+        found = self._confirmed(self._last, view, self._registered(self._last, view, np.eye(4)))
         if found.fitness <= to_key.fitness or not self._is_good(found):
             return to_key
         self._promote(self._last, self._step_to_last())
@@ -353,20 +359,37 @@ class _Tracker:
     def _from_missed(self, view: _View, missed: _View, to_key: Registration) -> Registration:
         """The motion from the frame lost before, which becomes a key frame by a guess, where these two register."""
         found = self._registrar.register(missed.prepared, view.prepared, np.eye(4))
+        found = self._confirmed(missed, view, found)
         if not self._is_good(found):
             return to_key
-        self._promote(missed, self._guessed(missed))
+        self._promote_by_guess(missed)
         return found
+
+    def _confirmed(self, target: _View, view: _View, by_clouds: Registration) -> Registration:
+        """The motion by flow from where clouds put the view. Without one that of the clouds, of fitness 0 where flow
+        could tell and they are not sure: from one frame to the next that is a cut in the recording.
+        """
+        by_flow = self._flowed(target, view, by_clouds.i_from_j) if self._is_good(by_clouds) else None
+        if by_flow is None and by_clouds.fitness < SURE_FITNESS and target.can_be_followed and view.can_be_followed:
+            self._is_cut |= view.place == self._last.place + 1
+            return replace(by_clouds, fitness=0.0)
+        return by_flow or by_clouds
 
     def _lose(self, view: _View, is_last: bool) -> None:
         """Its motion is a guess; the next frame tries the same key frame again."""
-        guess = self._guessed(view)
         if is_last:
-            self._promote(view, guess)
+            self._promote_by_guess(view)
             return
         if len(view.cloud):
             self._missed = view
-        self._rows[view.place] = (self._keys[-1].place, guess.i_from_j, np.nan)
+        self._rows[view.place] = (self._keys[-1].place, self._guessed(view).i_from_j, np.nan)
+
+    def _promote_by_guess(self, view: _View) -> None:
+        """The view becomes a key frame by a guess; over a cut by no step, since clouds alone would bridge it."""
+        if self._is_cut:
+            self._begin(view)
+        else:
+            self._promote(view, self._guessed(view))
 
     def _guessed(self, view: _View) -> Registration:
         motion = self._key_from_last @ self._ahead(view)

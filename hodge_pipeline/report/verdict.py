@@ -42,7 +42,7 @@ DOUBTS = {
     "tracking lost": "tracking was lost at {count} of {frames} frames",
 }
 REASONS = {
-    "camera or object": "much of the image moves",
+    "camera or object": "images contradict the camera's motion",
     "unheld": "what frames share lets them slide",
     "path loose": "the scans tell little of how far the scanner went",
     "reader's doubt": "the camera is assumed and images do not confirm it",

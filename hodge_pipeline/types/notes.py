@@ -41,8 +41,9 @@ DOUBTS = {
     "ambiguous": "{count} of {detail} pairs {count:fits|fit} in several ways, as in a bare room, and "
     "{count:joins|join} nothing: take scans in between, with furniture or targets in sight.",
     "none joined": "No two are joined: {detail}.",
-    "camera or object": "The path may in part be that of objects: in {count} of {detail}, more than a quarter of the "
-    "image moves otherwise than the camera is said to. Compare the model with the scene, or leave these frames out.",
+    "camera or object": "Objects that move, or colour and depth of two moments or views, may bend the path: in {count} "
+    "of {detail}, more than a quarter of the image moves otherwise than the camera is said to. Leave these frames out, "
+    "or see that each depth image has the colour of its moment, and is registered to it.",
     "unheld": "The path may slide: at {count} of {detail} what both frames see, such as a bare wall, does not hold "
     "the camera in every direction, and no other edge tests the step.",
     "path scaled": "The refined path is {detail} times as large as the one given: depth and the given poses are of "
