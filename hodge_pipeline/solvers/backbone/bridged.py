@@ -67,12 +67,16 @@ def infer_bridged(
     first = judge(chain)
     if first is None:
         return None
+    as_stated = _as_stated(chain, first, judge)
+    if as_stated is not None and _believed(as_stated, first):
+        first, as_stated = as_stated, None
     found = first
     for _ in range(most):
-        better = _better(chain, found, judge)
+        better = _better(chain, found, as_stated, judge)
         if better is None:
             break
         chain, found = better
+        as_stated = _as_stated(chain, found, judge)
     # a break found by unconfirmed loops is not confirmed either
     for one, other in [(chain, found)] if found is first else [(chain, found), (unbroken, first)]:
         if other.confirmed and not (_contradicted(other) and _found_by_chance(one, other, trusted, judge)):
@@ -102,12 +106,30 @@ def _found_by_chance(chain: Chain, found: Inferred, trusted: Bools, judge: Calla
     return False
 
 
-def _better(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]) -> tuple[Chain, Inferred] | None:
+def _as_stated(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]) -> Inferred | None:
+    """The loops judged with errors no larger than stated, where learned ones are larger or confirm no loop; else None.
+
+    A break under all loops looks like larger errors of all steps, and many loops that join right places by a wrong
+    motion like larger errors of all loops.
+    """
+    scales = found.scales.at_most_stated if chain.stated else Scales()
+    larger = chain.stated and (found.scales.prior_cost() > 0 or found.scales.loops_surprise)
+    return judge(chain, scales=scales) if found.scales != scales and (larger or not found.confirmed) else None
+
+
+def _believed(as_stated: Inferred, found: Inferred) -> bool:
+    """Whether loops judged with errors no larger than stated are to be believed rather than with learned ones."""
+    if not as_stated.confirmed or not as_stated.start.chain.stated:
+        return False
+    likelier = found.scales.loops_surprise and as_stated.log_evidence > found.log_evidence
+    return likelier or not found.confirmed
+
+
+def _better(
+    chain: Chain, found: Inferred, as_stated: Inferred | None, judge: Callable[..., Inferred | None]
+) -> tuple[Chain, Inferred] | None:
     """The chain with one more broken step bridged, and its loops judged; None where no step is broken."""
-    founds = [found]
-    if found.scales != Scales() and (not found.confirmed or (chain.stated and found.scales.prior_cost() > 0)):
-        # a break under all loops looks like larger errors of all steps: with errors as stated, the loops agree on it
-        founds += [other for other in [judge(chain, scales=Scales())] if other is not None]
+    founds = [found] if as_stated is None else [found, as_stated]
     for broken, least in [each for one in founds for each in _candidates(chain, one)]:
         tried = bridged(chain, broken)
         same = judge(tried, scales=found.scales)  # so that nothing but the step differs

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -57,6 +57,16 @@ class Scales:
     def prior_cost(self) -> float:
         """Minus the log-prior of the scales of steps above 1, in nats."""
         return float(0.5 * (np.log(np.maximum([self.step_turn, self.step_shift], 1.0)) ** 2).sum() / FOLD**2)
+
+    @property
+    def at_most_stated(self) -> Scales:
+        """Those of these scales that are below 1, the others 1."""
+        return Scales(*(min(each, 1.0) for each in astuple(self)))
+
+    @property
+    def loops_surprise(self) -> bool:
+        """Whether loops err more than what they state by over a standard deviation of the prior."""
+        return bool(max(self.loop_turn, self.loop_shift) > np.exp(FOLD))
 
     def units(self, chain: Chain) -> tuple[Floats, Floats]:
         """The factor on each free axis (p,), of steps and of loops."""
