@@ -27,8 +27,12 @@ def deskewed(cloud: PointCloud, velocity: Floats, after_s: float = 0.0) -> Point
     step = np.minimum(cloud.times_s / last_s * STEPS_A_SWEEP, STEPS_A_SWEEP - 1).astype(np.int64)
     middle_s = (np.arange(STEPS_A_SWEEP) + 0.5) / STEPS_A_SWEEP * last_s
     motions = se3.exp((middle_s - after_s)[:, None] * velocity).astype(np.float32)
-    points = np.einsum("nij,nj->ni", motions[step, :3, :3], cloud.points_in_cam) + motions[step, :3, 3]
-    points[~cloud.points_in_cam.any(axis=1)] = 0.0  # no returns stay what they are
+    x, y, z = cloud.points_in_cam.T
+    points = np.empty((len(cloud), 3), np.float32)
+    for axis in range(3):  # by columns: a matrix for each point takes five times as long
+        a, b, c, d = (np.ascontiguousarray(entry)[step] for entry in motions[:, axis].T)
+        points[:, axis] = a * x + b * y + c * z + d
+    points[(x == 0) & (y == 0) & (z == 0)] = 0.0  # no returns stay what they are
     return replace(cloud, points_in_cam=points, normals_in_cam=None, times_s=None)
 
 
