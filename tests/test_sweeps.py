@@ -116,6 +116,19 @@ def test_a_sweep_that_cannot_be_aligned_tells_nothing_of_how_far_the_scanner_wen
     assert loose == [False, False, True, False]
 
 
+def test_coarse_voxels_align_only_sweeps_that_fit_less_than_usual_where_they_are_predicted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tracker, aligned = ScanToMap(0.8, np.array([0, 0, 0, SPEED_M_S, 0, 0])), list[int]()
+    coarse = scan_to_map._Map._coarse
+    monkeypatch.setattr(scan_to_map._Map, "_coarse", lambda *given: (aligned.append(row), coarse(*given))[1])
+    for row in (0, 1, 2, 3, 4, 5, 6, 7, 8, 14):
+        cloud = cast(Callable[[], PointCloud], street()[row].read_points)()
+        tracker.follow(cloud, row * REVOLUTION_S)
+    assert set(aligned) == {1, 2, 3, 14}  # before it is known how well sweeps fit; a sweep that fits less well
+    assert tracker.pose[0, 3] == pytest.approx(14 * SPEED_M_S * REVOLUTION_S, abs=NEAR_M)
+
+
 @pytest.mark.parametrize(
     ("clock", "is_timed"), [("numbers", True), ("seconds", False), ("milliseconds from the first", True)]
 )

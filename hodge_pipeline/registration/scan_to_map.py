@@ -12,12 +12,14 @@ import small_gicp
 from hodge_pipeline import se3
 from hodge_pipeline.registration.assessment import MIN_POINTS
 from hodge_pipeline.registration.sweeps import deskewed
-from hodge_pipeline.types import Floats, Ints, PointCloud
+from hodge_pipeline.types import Floats, Floats32, Ints, PointCloud
 
 START_LEVELS, LEVELS = (9, 3, 1), (3, 1)
 """Sizes of the map's voxels, in finest voxels, coarse to fine: the coarsest catch an unknown velocity of 30 m/s."""
-LOOK_M, SAMPLE_M = 3.0, 0.7
-"""Correspondence distance at a level, in its voxels; voxel that a sweep is down-sampled to, in finest voxels."""
+LOOK_M, START_SAMPLE_M, SAMPLE_M = 3.0, 1.4, 0.7
+"""Correspondence distance at a level, in its voxels; voxel that a sweep is down-sampled to, in finest voxels, for the
+first velocity (in ten worlds as right with a third of the points) and for poses.
+"""
 NEIGHBOURS, MOST_ITERATIONS, SWEEPS_KEPT = 10, 30, 100
 """As small_gicp has them: points in a covariance; steps at a level; sweeps until a voxel that no sweep touches goes."""
 FLATTEST = 0.05
@@ -36,6 +38,10 @@ STRANGE, USUAL_OF, FEWEST_USUAL = 0.5, 10, 3
 """A sweep is strange that has half of the usual share of its points on the map: of the median of up to `USUAL_OF`
 sweeps before, at least `FEWEST_USUAL`. On a street with a tunnel it is 0.83 of that and more; of a mirrored sweep 0.42,
 of another city's 0.19, of one in feet 0.01.
+"""
+AS_USUAL = 0.9
+"""An alignment from the predicted pose with this share of the usual inliers needs none from the coarser levels: on
+streets, in forests, offices and fields that is nearly every sweep, and errors are the same with them and without.
 """
 ON_MAP = 0.5
 """Finest voxels from a Gaussian of the map within which a point lies on it."""
@@ -76,8 +82,11 @@ class ScanToMap:
     A Kalman filter of the velocity combines each alignment with the motion so far, which matters along a corridor.
     """
 
-    def __init__(self, voxel_m: float, velocity: Floats, levels: tuple[int, ...] = LEVELS) -> None:
-        self._voxel_m, self._map, self._coarsest_m = voxel_m, _Map(voxel_m, levels), LOOK_M * voxel_m * levels[0]
+    def __init__(
+        self, voxel_m: float, velocity: Floats, levels: tuple[int, ...] = LEVELS, sample_m: float = SAMPLE_M
+    ) -> None:
+        self._voxel_m, self._coarsest_m = voxel_m, LOOK_M * voxel_m * levels[0]
+        self._map = _Map(voxel_m, levels, sample_m)
         self.velocity, self.pose, self.turn_s, self.is_loose = velocity, np.eye(4), 0.0, False
         self._spread: Floats = FASTEST_M_S**2 * np.eye(3)  # covariance of the velocity, (m/s)^2
         self._time_s: float | None = None
@@ -89,7 +98,7 @@ class ScanToMap:
 
     def is_strange(self, step: Step) -> bool:
         """Whether a sweep fits the map far worse than those before it did."""
-        return len(self._usual) >= FEWEST_USUAL and step.on_map < STRANGE * float(np.median(self._usual))
+        return step.on_map < STRANGE * _usual(self._usual)
 
     def accept(self, step: Step) -> None:
         """The sweep placed last joins the map, and its motion the filter."""
@@ -106,10 +115,11 @@ class ScanToMap:
         before, velocity, rates = self.pose, self.velocity, [self.velocity]
         predicted, spread = before @ se3.exp(velocity * duration), self._spread
         moved_spread = spread = spread + (ACCELERATION_M_S2 * duration) ** 2 * np.eye(3)
+        far_m = _far_m(cloud.points_in_cam)
         for _ in range(MOST_DESKEWS):
             points = deskewed(cloud, rates[-1], turn_s / 2).points_in_cam.astype(np.float64)
             guesses = [before @ se3.exp(velocity * duration)]
-            if self._shift_m(velocity, points, abs(duration)) > self._coarsest_m:
+            if _shift_m(velocity, far_m, abs(duration)) > self._coarsest_m:
                 guesses.append(before)  # after a gap the scanner may be where it was
             pose, information = self._map.align(points, guesses)
             is_loose = information is None and self._time_s is not None
@@ -121,15 +131,20 @@ class ScanToMap:
             moved_spread = moved / duration**2
             velocity = se3.log(se3.inverse(before) @ pose) / duration
             rates.append(velocity)
-            if not turn_s or self._shift_m(rates[-1] - rates[-2], points, turn_s / 2) < self._voxel_m / 2:
+            if not turn_s or _shift_m(rates[-1] - rates[-2], far_m, turn_s / 2) < self._voxel_m / 2:
                 break
         on_map = self._map.share_at(pose) if information is not None else np.nan
         return Step(pose, time_s, velocity, moved_spread, turn_s, is_loose, on_map)
 
-    def _shift_m(self, rates: Floats, points: Floats, seconds: float) -> float:
-        """Metres by which a velocity moves the farther points, at quantile `FARTHER`, in this time."""
-        range_m = np.quantile(np.linalg.norm(points, axis=1), FARTHER)
-        return float((np.linalg.norm(rates[:3]) * range_m + np.linalg.norm(rates[3:])) * seconds)
+
+def _far_m(points: Floats32) -> float:
+    """The distance of the farther points (N, 3), at quantile `FARTHER`."""
+    return float(np.sqrt(np.quantile(np.einsum("ni,ni->n", points, points), FARTHER)))
+
+
+def _shift_m(rates: Floats, far_m: float, seconds: float) -> float:
+    """Metres by which a velocity moves points so far away in this time."""
+    return float((np.linalg.norm(rates[:3]) * far_m + np.linalg.norm(rates[3:])) * seconds)
 
 
 def _kalman_update(predicted: Floats, spread_m2: Floats, aligned: Floats, information: Floats) -> tuple[Floats, Floats]:
@@ -169,26 +184,32 @@ def first_velocity(voxel_m: float, sweeps: Sequence[tuple[float, PointCloud]]) -
     """The twist per second (6,) at the first of these sweeps, each with its time: tracked forwards and backwards until
     it converges.
 
-    A first pass from rest gives too small a velocity, since rings on the ground look the same ahead.
+    A first pass from rest gives too small a velocity, since rings on the ground look the same ahead. It has converged
+    where one end of the sweeps has the velocity that it had before: each pass depends on the one that it begins with.
     """
-    velocity = np.zeros(6)
-    for _ in range(MOST_PASSES if len(sweeps) > 1 else 0):
-        before = velocity
-        for way in (sweeps, sweeps[::-1]):
-            tracker = ScanToMap(voxel_m, velocity, START_LEVELS)
-            for time_s, cloud in way:
-                tracker.follow(cloud, time_s)
-            velocity = tracker.velocity
-        if np.linalg.norm((velocity - before)[3:]) * (sweeps[1][0] - sweeps[0][0]) < voxel_m / 2:
+    ends: list[Floats] = [np.zeros(6)]  # in turn at the first and at the last of the sweeps
+    while len(sweeps) > 1 and len(ends) <= 2 * MOST_PASSES:
+        tracker = ScanToMap(voxel_m, ends[-1], START_LEVELS, START_SAMPLE_M)
+        for time_s, cloud in sweeps if len(ends) % 2 else sweeps[::-1]:
+            tracker.follow(cloud, time_s)
+        ends.append(tracker.velocity)
+        step_m = np.linalg.norm((ends[-1] - ends[max(0, len(ends) - 3)])[3:]) * (sweeps[1][0] - sweeps[0][0])
+        if len(ends) > 2 and step_m < voxel_m / 2:
             break
-    return velocity
+    return ends[(len(ends) - 1) // 2 * 2]
+
+
+def _usual(shares: deque[float]) -> float:
+    """The median share of the sweeps before; NaN where there are too few."""
+    return float(np.median(shares)) if len(shares) >= FEWEST_USUAL else np.nan
 
 
 class _Map:
     """Voxels of Gaussians (Koide et al., ICRA 2021) of the sweeps so far, at several sizes, coarse to fine."""
 
-    def __init__(self, voxel_m: float, levels: tuple[int, ...]) -> None:
-        self._voxel_m, self._is_empty, self._sweep, self._spurious = voxel_m, True, None, 0.0
+    def __init__(self, voxel_m: float, levels: tuple[int, ...], sample_m: float) -> None:
+        self._sample_m, self._is_empty, self._sweep, self._spurious = sample_m * voxel_m, True, None, 0.0
+        self._share, self._shares = np.nan, deque[float](maxlen=USUAL_OF)  # of inliers: of the sweep, of those before
         self._levels = [(size * voxel_m, small_gicp.GaussianVoxelMap(size * voxel_m)) for size in levels]
         for _, voxels in self._levels:
             voxels.set_lru(horizon=SWEEPS_KEPT)
@@ -197,17 +218,19 @@ class _Map:
         """The pose of a sweep by points (N, 3) and its information (6, 6), rotation first, in its own axes; the first
         guess and None where it could not be aligned.
         """
-        self._sweep = self._thinned(points) if len(points) >= MIN_POINTS else None
+        self._sweep, self._share = self._thinned(points) if len(points) >= MIN_POINTS else None, np.nan
         if self._sweep is None or self._sweep.size() < MIN_POINTS or self._is_empty:
             return guesses[0], None
-        starts = [start for guess in guesses for start in (guess, self._coarse(guess))]
-        found = [self._aligned(self._levels[-1], start) for start in starts]
+        count = self._sweep.size()
+        found = [self._aligned(self._levels[-1], guess) for guess in guesses]
+        if len(found) > 1 or not found[0].num_inliers >= AS_USUAL * count * _usual(self._shares):
+            found += [self._aligned(self._levels[-1], self._coarse(guess)) for guess in guesses]
         held = [one for one in found if one.num_inliers >= MIN_POINTS and se3.is_motion(one.T_target_source)]
         if not held:
             return guesses[0], None
         usual = min(one.error / one.num_inliers for one in held)
-        count = self._sweep.size()
         best = min(held, key=lambda one: one.error + (count - one.num_inliers) * UNMATCHED * usual)
+        self._share = best.num_inliers / count
         information = np.asarray(best.H) / (SHARED_ERRORS**2 * max(usual, 1e-12))
         return np.asarray(best.T_target_source), _without_spurious(information, self._spurious)
 
@@ -240,6 +263,8 @@ class _Map:
         """The sweep aligned last joins the map."""
         if self._sweep is None:
             return
+        if np.isfinite(self._share):
+            self._shares.append(self._share)
         for _, voxels in self._levels:
             voxels.insert(self._sweep, pose)
         self._is_empty = False
@@ -250,7 +275,7 @@ class _Map:
         Normals from k neighbours have a variance of λ3 / (λ2 k), and this share of the information along a bare wall is
         spurious: 0.4 % in a tunnel at 16 beams, where alignment would stop the scanner.
         """
-        sweep = small_gicp.voxelgrid_sampling(points, SAMPLE_M * self._voxel_m)
+        sweep = small_gicp.voxelgrid_sampling(points, self._sample_m)
         sampled = np.asarray(sweep.points())[:, :3]
         if len(sampled) > NEIGHBOURS:
             rows, _ = small_gicp.KdTree(sweep).batch_knn_search(sampled, NEIGHBOURS)
@@ -279,9 +304,7 @@ def _variances(points: Floats, rows: Ints) -> tuple[Floats, Floats, Floats]:
     """
     around = [column[rows.T] for column in np.ascontiguousarray(points.T)]
     x, y, z = (column - column.mean(axis=0) for column in around)
-    xx, yy, zz, xy, xz, yz = (
-        np.einsum("kn,kn->n", a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))
-    )
+    xx, yy, zz, xy, xz, yz = (np.einsum("kn,kn->n", a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z)))
     mean = (xx + yy + zz) / 3
     a, b, c = xx - mean, yy - mean, zz - mean
     spread = np.sqrt((a * a + b * b + c * c + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
