@@ -18,7 +18,7 @@ START_LEVELS, LEVELS = (9, 3, 1), (3, 1)
 """Sizes of the map's voxels, in finest voxels, coarse to fine: the coarsest catch an unknown velocity of 30 m/s."""
 LOOK_M, START_SAMPLE_M, SAMPLE_M = 3.0, 1.4, 0.7
 """Correspondence distance at a level, in its voxels; voxel that a sweep is down-sampled to, in finest voxels, for the
-first velocity (in ten worlds as right with a third of the points) and for poses.
+first velocity (in twenty worlds as right with half to two thirds of the points) and for poses.
 """
 NEIGHBOURS, MOST_ITERATIONS, SWEEPS_KEPT = 10, 30, 100
 """As small_gicp has them: points in a covariance; steps at a level; sweeps until a voxel that no sweep touches goes."""
