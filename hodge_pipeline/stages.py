@@ -277,6 +277,11 @@ class TrackedModel(Protocol):
     def seen_points(self) -> CloudSet:
         """For each body the points that its images track, in its axes and the model's unit, with their colours."""
 
+    def thinned(self, most_seen: int) -> TrackedModel:
+        """The model with a random part of its tracks, of which each image sees so many, or all of its own; this very
+        model where no image sees more.
+        """
+
     def measured(self) -> tuple[ViewGraph, tuple[str, ...]]:
         """Relative poses of the bodies, estimated anew from what their images share, and what was left out."""
 
@@ -307,8 +312,13 @@ class TrackedModel(Protocol):
     def merged(self) -> TrackedModel:
         """Points that a match calls one merged where one position fits; this very model where there are none."""
 
-    def adjusted(self, priors: PositionPriors | None = None, *, move_bodies: bool = True) -> TrackedModel:
-        """Bundle adjustment of poses and points, or of points alone. Raises `SourceError` where it fails."""
+    def adjusted(
+        self, priors: PositionPriors | None = None, *, move_bodies: bool = True, near_optimum: bool = False
+    ) -> TrackedModel:
+        """Bundle adjustment of poses and points, or of points alone; with larger steps where it starts near an optimum.
+
+        Raises `SourceError` where it fails.
+        """
 
     def with_robust_loss(self) -> TrackedModel:
         """The same model, whose adjustments let an observation that is far off pull little."""

@@ -79,6 +79,9 @@ class Model:
     def scaled(self, factor: float, motion: Any = None) -> Any:
         return self._inner.scaled(1.0 if self._how == "one scale" else factor, motion)
 
+    def thinned(self, most_seen: int) -> Any:
+        return self._inner.thinned(1) if self._how == "thins all" else self._inner.thinned(most_seen)
+
     def moved(self, poses: Floats) -> Any:
         return self._inner if self._how == "stays" else self._inner.moved(poses)
 

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 import hodge_pipeline
+from hodge_adapters.colmap import bundle, tracked
 from hodge_adapters.colmap.content import read_model
 from hodge_adapters.colmap.models import ColmapModels
 from hodge_adapters.colmap.scale import seen_depths
@@ -232,19 +235,48 @@ def test_an_optimal_model_is_given_back_byte_for_byte(tmp_path: Path) -> None:
         assert (tmp_path / "out/sparse/0" / name).read_bytes() == (model / name).read_bytes()
 
 
-def test_a_reconstruction_goes_in_and_comes_out(tmp_path: Path) -> None:
+def test_a_reconstruction_goes_in_and_comes_out_and_nothing_is_computed_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     model = noisy(tmp_path)
     start = pycolmap.Reconstruction(disturbed(model, tmp_path / "start"))
+    counts = {name: Mock(wraps=getattr(tracked, name)) for name in ("content_of", "standard_errors")}
+    for name, counted in counts.items():
+        monkeypatch.setattr(tracked, name, counted)
     (refined,) = hodge_pipeline.refine_colmap(start, database="none", overrides=FREE).models
+    assert {name: counted.call_count for name, counted in counts.items()} == {"content_of": 0, "standard_errors": 1}
     refined.update_point_3d_errors()
     assert refined.compute_mean_reprojection_error() <= 1.001 * error_px(model)
+
+
+def test_an_adjustment_near_its_optimum_takes_few_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from benchmarks.synthetic_colmap import make
+
+    (tmp_path / "street").mkdir()
+    make("street", 12, 1).write(tmp_path / "street")
+    steps: list[int] = []
+
+    def solve(adjuster: pycolmap.BundleAdjuster) -> None:
+        steps.append(int(re.findall(r"Iterations: (\d+)", adjuster.solve().brief_report())[0]))
+
+    monkeypatch.setattr(bundle, "_solve", solve)
+    for path, off in ((noisy(tmp_path), 0.05), (tmp_path / "street", 0.001)):
+        (model,) = ColmapModels().open_models(path)
+        xi = off * np.random.default_rng(0).normal(size=(len(model.body_names), 6))
+        near = model.moved(model.world_from_body @ se3.exp(xi))
+        found, other = near.adjusted(near_optimum=True), near.adjusted()
+        np.testing.assert_allclose(found.quality.errors_px, other.quality.errors_px, atol=1e-4)
+    assert steps[0] <= 8, "it goes on among rounding errors"
+    assert 2 * steps[2] <= steps[3], "its first steps are short"
 
 
 def spoil(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every bundle adjustment from now on leaves the bodies anywhere."""
     honest = ColmapModel.adjusted
 
-    def adjusted(self: ColmapModel, priors: object = None, *, move_bodies: bool = True) -> ColmapModel:
+    def adjusted(
+        self: ColmapModel, priors: object = None, *, move_bodies: bool = True, near_optimum: bool = False
+    ) -> ColmapModel:
         model = honest(self, None, move_bodies=move_bodies)
         rng = np.random.default_rng(0)
         for frame_id, pose in zip(model.bodies.frame_ids, model.world_from_body, strict=True):

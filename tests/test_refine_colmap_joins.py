@@ -171,6 +171,11 @@ def test_depth_makes_the_model_metric(tmp_path: Path) -> None:
     whole = pycolmap.Reconstruction(model)
     whole.transform(pycolmap.Sim3d(0.3, pycolmap.Rotation3d(), np.zeros(3)))
     assert distance(done.models[0], whole, with_scale=False) < 5e-3
+    given, metric = (
+        np.mean(list(poses_by_name(one).values()), axis=0)[:3, 3]
+        for one in (pycolmap.Reconstruction(model), done.models[0])
+    )
+    np.testing.assert_allclose(metric, given, atol=0.05, err_msg="it is scaled where it stands")
     again = hodge_pipeline.refine_colmap(tmp_path / "out", **options)
     assert again.results[0].decision.outcome == "optimal", "what is metric and optimal is left alone"
 

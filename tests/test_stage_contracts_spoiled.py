@@ -151,6 +151,7 @@ def test_a_rewriter_that_breaks_its_contract_is_noticed(rewriter: Any, what: str
         (Models("sheared"), "measured", "an edge is not a rigid motion"),
         (Models("one cloud less"), "seen points", "points of"),
         (Models("one scale"), "another unit", "does not double the positions"),
+        (Models("thins all"), "thinned", "of a model that has few"),
         (Models("stays"), "moved", "not at the poses that were given"),
         (Models("no notes"), "read back", "the notes are lost"),
     ],

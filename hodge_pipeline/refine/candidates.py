@@ -111,12 +111,14 @@ class _Candidates:
         priors: PositionPriors | None = None,
         *,
         move_bodies: bool = True,
+        near_optimum: bool = False,
     ) -> None:
         """Adjust a model, as a step, from its own poses or from these (B, 4, 4), or its points alone; a failure is a
         note.
         """
+        start = model, poses, priors or self._known
         try:
-            found = self._steps.step(adjusted_model, model, poses, priors or self._known, move_bodies, title=name)
+            found = self._steps.step(adjusted_model, *start, move_bodies, near_optimum, title=name)
         except SourceError as error:
             self.notes.append(f"{name}: {error}")
             return
@@ -145,7 +147,8 @@ def make_candidates(
     found.add(ADJUSTED, start)
     if not found.costs[0].is_sound:
         poses = steps.step(resected_poses, start, None, title="resection").poses
-        found.add(RESECTED, start, poses)
+        # where the best is sound this only tells whether it is the optimum
+        found.add(RESECTED, start, poses, near_optimum=found.costs[found.best].is_sound)
         if not found.costs[found.best].is_sound:
             first_robust = len(found.candidates)
             key, model = steps.key([start, ROBUST]), start.with_robust_loss()
@@ -238,17 +241,24 @@ class AdjustedModel:
 
 
 def adjusted_model(
-    start: TrackedModel, poses: Floats | None, priors: PositionPriors | None, move_bodies: bool = True, *, step: Step
+    start: TrackedModel,
+    poses: Floats | None,
+    priors: PositionPriors | None,
+    move_bodies: bool = True,
+    near_optimum: bool = False,
+    *,
+    step: Step,
 ) -> AdjustedModel:
     """Step: bundle adjustment from the model's own poses, or from these (B, 4, 4) with matched points merged.
 
     Adjustment brings more matched points together: these are merged after it, and adjusted once more. Without
-    `move_bodies` its points alone are adjusted, and none is merged. Raises `SourceError` where it fails.
+    `move_bodies` its points alone are adjusted, and none is merged. `near_optimum`: see `TrackedModel.adjusted`.
+    Raises `SourceError` where it fails.
     """
     if not move_bodies:
         return _written(start.moved(start.world_from_body).adjusted(move_bodies=False), step)
     model = start if poses is None else start.moved(poses).merged()
-    adjusted = model.adjusted(priors)
+    adjusted = model.adjusted(priors, near_optimum=near_optimum)
     if poses is not None:
         merged = adjusted.merged()
         adjusted = adjusted if merged is adjusted else merged.moved(merged.world_from_body).adjusted(priors)

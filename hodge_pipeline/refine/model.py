@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.difference import alike
 from hodge_pipeline.executors.dask import open_workers
@@ -108,7 +109,13 @@ def _unfit(model: TrackedModel) -> str:
 
 def in_metres(model: TrackedModel, scale: Scale) -> TrackedModel:
     """The model in metres; unchanged where depth does not tell its scale, or tells that it is in metres."""
-    return model if scale.is_one or not scale.is_observable else model.scaled(scale.metres_per_unit)
+    return model if scale.is_one or not scale.is_observable else _resized(model, scale.metres_per_unit)
+
+
+def _resized(model: TrackedModel, factor: float) -> TrackedModel:
+    """The model times the factor about the mean of its bodies: about a far origin (UTM) it would move by kilometres."""
+    centre = model.world_from_body[:, :3, 3].mean(axis=0)
+    return model.scaled(factor, se3.from_parts(np.eye(3), (1 - factor) * centre))
 
 
 def _refine(
@@ -129,7 +136,7 @@ def _refine(
     in_world = start.known_positions is not None
     final = metric_scale(model.seen_depths()) if any(scale.is_observable for scale in scales) else scales[0]
     if final.is_observable and not in_world:
-        model, final = model.scaled(final.metres_per_unit), replace(final, metres_per_unit=1.0)
+        model, final = _resized(model, final.metres_per_unit), replace(final, metres_per_unit=1.0)
         model = in_frame_of(start, model, keeps_size=True) if at else model
     change = _change(start, scales[0], model, in_world) if len(inputs) == 1 and at else None
     cost = found.costs[at]

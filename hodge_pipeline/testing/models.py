@@ -17,6 +17,8 @@ from hodge_pipeline.types import Floats
 
 NEAR = 1e-6
 """What a file of 17 digits and a few products of matrices lose."""
+FEW_SEEN = 5
+"""Observations of an image in a thinned model."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,14 @@ def _is_scaled(case: _Case) -> None:
     _assert_near(model.world_from_body, before, "scaling a model changes the model itself")
 
 
+def _is_thinned(case: _Case) -> None:
+    model = _model(case)
+    assert model.thinned(len(model.quality.errors_px)) is model, "tracks are left out of a model that has few"
+    seen, left = (np.bincount(one.quality.keypoints[:, 0]) for one in (model, model.thinned(FEW_SEEN)))
+    assert (left >= np.minimum(seen, FEW_SEEN)).all(), "an image is left with fewer observations than were asked for"
+    assert seen.max() <= FEW_SEEN or left.sum() < seen.sum(), "no track is left out"
+
+
 def _is_moved(case: _Case) -> None:
     model = _model(case)
     before = model.world_from_body
@@ -110,6 +120,7 @@ check_model_reader = Contract(
         "measured": _measures,
         "seen points": _sees_points,
         "another unit": _is_scaled,
+        "thinned": _is_thinned,
         "moved": _is_moved,
         "read back": _is_read_back,
     },

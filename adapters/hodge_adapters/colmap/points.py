@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from hodge_adapters.colmap.cameras import colmap_camera
 from hodge_adapters.colmap.pycolmap_import import pycolmap
-from hodge_adapters.colmap.records import Model
+from hodge_adapters.colmap.records import NO_POINT, Model, Points
 from hodge_pipeline import se3
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types import Bools, Floats, Ints
 
 LEAST_PARALLAX = 1e-4
 """Smallest eigenvalue over the number of rays, below which they are parallel: an angle of about a degree."""
@@ -103,6 +105,37 @@ def _sum(values: Floats, owner: Ints, count: int) -> Floats:
 
 def _mean(values: Floats, owner: Ints, count: int) -> Floats:
     return _sum(values, owner, count) / np.maximum(np.bincount(owner, minlength=count), 1)[:, None]
+
+
+def thinned_points(model: Model, most_seen: int) -> Bools:
+    """Which points (P,) stay where each image keeps so many of its own: those first in one random order of all, so that
+    images keep the same ones.
+    """
+    points = model.points
+    place = np.random.default_rng(0).permutation(len(points.ids))
+    kept = np.zeros(len(points.ids), bool)
+    for here in model.entries:
+        own = np.unique(points.owners[here])
+        kept[own[np.argsort(place[own])[:most_seen]]] = True
+    return kept
+
+
+def with_points(model: Model, kept: Bools) -> Model:
+    """The model with these of its points (P,) alone."""
+    points = model.points
+    entries, lengths = kept[points.owners], np.diff(points.offsets)[kept]
+    left = Points(
+        ids=points.ids[kept],
+        xyz=points.xyz[kept],
+        offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+        image_ids=points.image_ids[entries],
+        columns=points.columns[entries],
+    )
+    images = [
+        replace(image, point_ids=np.where(np.isin(image.point_ids, left.ids), image.point_ids, NO_POINT))
+        for image in model.images
+    ]
+    return replace(model, images=images, points=left)
 
 
 def error_cap(errors_px: Floats) -> float:

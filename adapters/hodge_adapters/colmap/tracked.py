@@ -19,7 +19,14 @@ from hodge_adapters.colmap.bundle import Refine, adjust
 from hodge_adapters.colmap.content import content_of, read_reconstruction, refreshed
 from hodge_adapters.colmap.database import database_pairs
 from hodge_adapters.colmap.edges import covisible_pairs, measured_graph
-from hodge_adapters.colmap.points import parallaxes, points_of_rays, reprojection_errors, update_errors
+from hodge_adapters.colmap.points import (
+    parallaxes,
+    points_of_rays,
+    reprojection_errors,
+    thinned_points,
+    update_errors,
+    with_points,
+)
 from hodge_adapters.colmap.priors import Known, body_priors, placing
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import Model
@@ -242,6 +249,19 @@ class ColmapModel:
         update_errors(copy)
         return replace(self, reconstruction=copy, files=(), tracks=before)
 
+    def thinned(self, most_seen: int) -> ColmapModel:
+        """A random part of the tracks, of which each image sees so many, or all of its own; this very model where no
+        image sees more. They are the same for models of the same tracks.
+        """
+        records = self.records
+        kept = thinned_points(records, most_seen)
+        if kept.all():
+            return self
+        copy = self._copy()
+        for point_id in records.points.ids[~kept].tolist():
+            copy.delete_point3D(point_id)
+        return replace(self, reconstruction=copy, files=(), tracks=with_points(records, kept))
+
     def merged(self) -> ColmapModel:
         """What the database matched is one point where one position fits; this very model where nothing is merged."""
         if not self.held_apart:
@@ -255,19 +275,21 @@ class ColmapModel:
         notes = (*self.notes, f"{counted(count, 'pair')} of points that a match calls one were merged")
         return replace(self, reconstruction=copy, files=(), notes=notes, tracks=None)
 
-    def adjusted(self, priors: PositionPriors | None = None, *, move_bodies: bool = True) -> ColmapModel:
+    def adjusted(
+        self, priors: PositionPriors | None = None, *, move_bodies: bool = True, near_optimum: bool = False
+    ) -> ColmapModel:
         """Bundle adjustment with rigs held, and intrinsics unless they are to be refined; see `colmap_bundle`.
 
         Where it leaves a few points behind their cameras, those are placed anew and all is adjusted once more.
         """
-        first = self._adjusted(priors, move_bodies)
+        first = self._adjusted(priors, move_bodies, near_optimum)
         behind = len(first._behind())
         if not 0 < behind <= FEW_BEHIND * len(first.quality.errors_px):
             return first
         placed = first.moved(first.world_from_body)
         return placed._adjusted(priors, move_bodies) if len(placed._behind()) < behind else first
 
-    def _adjusted(self, priors: PositionPriors | None, move_bodies: bool) -> ColmapModel:
+    def _adjusted(self, priors: PositionPriors | None, move_bodies: bool, near_optimum: bool = False) -> ColmapModel:
         copy = self._copy()
         refine: Refine = self.refine if move_bodies else "none"
         loose = adjust(
@@ -279,6 +301,7 @@ class ColmapModel:
             refine=refine,
             robust=self.robust,
             roughly=self.roughly,
+            near_optimum=near_optimum,
         )
         if loose:
             after = refreshed(self.records, copy)
@@ -309,6 +332,10 @@ class ColmapModel:
 
     def standard_errors(self) -> Floats:
         """Of each body's rotation and position (B, 2), radians and units; see `colmap_uncertainty`."""
+        return self._standard_errors
+
+    @cached_property
+    def _standard_errors(self) -> Floats:
         return standard_errors(self.records, self.bodies)
 
     def held_out_errors(self, entries: Bools, adjusts: Adjusted) -> Floats:
@@ -326,7 +353,8 @@ class ColmapModel:
                 image = records.images[records.image_rows[at]]
                 copy.delete_observation(image.image_id, int(records.points.columns[at]))
         if adjusts != "nothing":
-            adjust(copy, [], self.bodies, None, move_bodies=adjusts == "all", robust=self.robust)
+            everything = adjusts == "all"  # an adjusted model is near its optimum without a part of the entries
+            adjust(copy, [], self.bodies, None, move_bodies=everything, robust=self.robust, near_optimum=everything)
         return reprojection_errors(refreshed(records, copy))[1][held]
 
     def write(self, folder: Path) -> None:
@@ -336,7 +364,10 @@ class ColmapModel:
     def read_back(self, folder: Path, notes: tuple[str, ...]) -> ColmapModel:
         """The model of that folder with the frames, depth and database of this one."""
         back = read_reconstruction(folder)
-        return replace(self, reconstruction=back, files=(), notes=(*notes, *self._refined_cameras(back)), tracks=None)
+        # merging alone changes tracks, and leaves fewer points
+        tracks = self.records if back.num_points3D() == self.reconstruction.num_points3D() else None
+        notes = *notes, *self._refined_cameras(back)
+        return replace(self, reconstruction=back, files=(), notes=notes, tracks=tracks)
 
     def _refined_cameras(self, after: pycolmap.Reconstruction) -> tuple[str, ...]:
         """Lines on how the adjustment to another model changed rigs, focal lengths and principal points."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from hodge_adapters.colmap.bodies import Bodies
 from hodge_adapters.colmap.cameras import colmap_camera
@@ -17,6 +18,8 @@ GAUGE = 7
 """Turn, shift and size of the whole, which no track tells."""
 MOST_BODIES_JOINTLY = 300
 """Above it the joint covariance (6 B)² costs too much: each body is then taken given all others, which is too sure."""
+MOST_POINTS_AT_ONCE = 16384
+"""Whose part of the joint normal matrix is in memory at once."""
 STEP = 1e-6
 LEAST_SEEN = 3
 """Observations that fix a pose."""
@@ -78,15 +81,17 @@ def _schur(rows: _Rows, count: int, joint: bool) -> Floats:
     if not joint:
         np.add.at(normal, rows.body, -mixed @ np.swapaxes(mixed, 1, 2))
         return normal
-    out = np.zeros((count, 6, count, 6))
-    out[np.arange(count), :, np.arange(count)] = normal
-    for start in range(0, size, 4096):
-        part = (rows.point >= start) & (rows.point < start + 4096)
-        block = np.zeros((count, min(4096, size - start), 6, 3))
-        np.add.at(block, (rows.body[part], rows.point[part] - start), mixed[part])
-        flat = block.transpose(0, 2, 1, 3).reshape(count * 6, -1)
-        out -= (flat @ flat.T).reshape(out.shape)
-    return out.reshape(6 * count, 6 * count)
+    blocks = np.zeros((count, 6, count, 6))
+    blocks[np.arange(count), :, np.arange(count)] = normal
+    out = blocks.reshape(6 * count, 6 * count)
+    for start in range(0, size, MOST_POINTS_AT_ONCE):
+        at = np.flatnonzero((rows.point >= start) & (rows.point < start + MOST_POINTS_AT_ONCE))
+        row = np.broadcast_to((6 * rows.body[at, None] + np.arange(6))[:, :, None], (len(at), 6, 3))
+        column = np.broadcast_to((3 * (rows.point[at, None] - start) + np.arange(3))[:, None], row.shape)
+        shape = 6 * count, 3 * MOST_POINTS_AT_ONCE
+        part = csr_array((mixed[at].ravel(), (row.ravel(), column.ravel())), shape)
+        out -= (part @ part.T).toarray()
+    return out
 
 
 def _inverse_without_gauge(matrix: Floats) -> Floats:
