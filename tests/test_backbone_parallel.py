@@ -11,7 +11,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import has_unit_information, in_vertex_order
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.solvers.backbone.chain import consecutive_edges
-from hodge_pipeline.solvers.backbone.parallel import FEWEST, fused
+from hodge_pipeline.solvers.backbone.parallel import FEWEST, fused, loops_once
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.types import Ints, ViewGraph
 from tests.backbone_graphs import STEP, drive
@@ -144,6 +144,16 @@ def test_a_loop_that_is_written_again_otherwise_is_no_copy() -> None:
     motions[-1] = motions[-1] @ se3.exp(np.array([0, 0, 0.5, 3.0, 0, 0]))
     found = diagnose(replace(graph, i_from_j=motions))
     assert found.kept[:-1].all() and found.verdict[-1] == "wrong"
+
+
+def test_two_loops_between_the_same_views_that_differ_are_no_copies_where_information_is_unknown() -> None:
+    """One of them may be wrong, and how far copies differ is not known from a few pairs."""
+    graph = drive(wrong=0.0, loops=40).graph
+    steps = np.append(consecutive_edges(graph), [False] * 4)
+    for number, row in enumerate(np.flatnonzero(~steps)[:4]):
+        graph = with_copies(graph, int(row), 1, apart=0.02 * (1 + number))
+    graph = replace(graph, information=np.tile(np.eye(6), (graph.edge_count, 1, 1)))
+    assert not len(loops_once(fused(graph, steps), ~steps).copies)
 
 
 def test_copies_of_an_edge_of_a_window_are_of_its_steps() -> None:

@@ -97,9 +97,9 @@ def _apart(graph: ViewGraph, first: Ints, second: Ints) -> tuple[Floats, Floats]
 
 
 def _usual(graph: ViewGraph, chi2: Floats) -> float:
-    """The usual χ² per axis, no less than is stated."""
+    """The usual χ² per axis, no less than is stated; of few edges as stated, or that of exact copies."""
     least = np.finfo(float).eps if has_unit_information(graph) else 1.0
-    return max(float(np.median(chi2)) / len(free_axes(graph)), least) if len(chi2) else least
+    return max(float(np.median(chi2)) / len(free_axes(graph)), least) if len(chi2) >= FEWEST else least
 
 
 def _mean(graph: ViewGraph, first: Ints, second: Ints, apart: Floats) -> tuple[Floats, Floats]:
