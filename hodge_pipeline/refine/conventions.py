@@ -73,8 +73,12 @@ class Explained:
         return self.missed > 1
 
 
-def explained(world_from_key: Floats, edges: Ints, i_from_j: Floats, arm_m: float) -> Explained:
-    """How given poses (K, 4, 4) explain registered edges (E, 2) with motions (E, 4, 4); a turn counts at `arm_m`."""
+def explained(
+    world_from_key: Floats, edges: Ints, i_from_j: Floats, arm_m: float, poses: str = "poses given"
+) -> Explained:
+    """How poses (K, 4, 4), called `poses`, explain registered edges (E, 2) with motions (E, 4, 4); a turn counts at
+    `arm_m`.
+    """
     turned, moved_m = se3.rotation_angle(i_from_j), np.linalg.norm(i_from_j[:, :3, 3], axis=1)
     motion_m = float(np.median(turned * arm_m + moved_m)) if len(edges) else 0.0
     if len(edges) < FEWEST_EDGES or not motion_m > 0:
@@ -86,7 +90,7 @@ def explained(world_from_key: Floats, edges: Ints, i_from_j: Floats, arm_m: floa
     of = f"of {counted(len(edges), 'registered pair')}"
     turned_deg = float(np.rad2deg(np.median(turned)))
     if se3.rotation_angle(given).max() < SAME_RAD and np.any(given[:, :3, 3]) and turned_deg > TURNED_DEG:
-        told = f"the poses given all have the same rotation, and the camera turned by {turned_deg:.2g}° (median {of})"
+        told = f"the {poses} all have the same rotation, and the camera turned by {turned_deg:.2g}° (median {of})"
         return Explained(missed, f"{told}: give poses with their rotations; positions alone go to positions.path")
     as_others = [
         _missed_m(_motions(reading.of(world_from_key), edges), i_from_j, arm_m) / motion_m for reading in READINGS
@@ -95,7 +99,7 @@ def explained(world_from_key: Floats, edges: Ints, i_from_j: Floats, arm_m: floa
     if as_others[best] >= EXPLAINS * min(missed, 1.0):
         return Explained(missed)
     shares = f"as such they miss {as_others[best]:.2f} of the motion (median {of}), as they were read {missed:.2f}"
-    looks = f"the poses given look like {READINGS[best].looks}"
+    looks = f"the {poses} look like {READINGS[best].looks}"
     return Explained(missed, f"{looks}: {shares}: {READINGS[best].advice}")
 
 

@@ -30,6 +30,7 @@ from hodge_pipeline.report.contents import (
 from hodge_pipeline.report.photographs import changed_most, four_sides, worst_pairs
 from hodge_pipeline.report.refined import summary
 from hodge_pipeline.report.summary import graph_summary, trajectory_rows, unheld, weigh_wrong, worst_edges
+from hodge_pipeline.report.truth import truth_doubts
 from hodge_pipeline.rounds.settling import last_shift_m
 from hodge_pipeline.scene import (
     START,
@@ -82,7 +83,11 @@ def make_report(
         graph=graph_summary(last.edges, last.vertex_ids, component),
         worst_edges=worst,
         stages=tuple(StageRow(c["title"], c["wall_s"], c["cpu_s"], c["peak_mb"]) for c in store.costs()),
-        notes=(*store.notes, *(() if scans else unheld(last.edges, last.vertex_ids, recipe.acceptance.min_spread))),
+        notes=(
+            *store.notes,
+            *(() if scans else unheld(last.edges, last.vertex_ids, recipe.acceptance.min_spread)),
+            *truth_doubts(scene.whole, scene.key_frames, last, world_from_cam, se3.ARM_M * float(recipe.scale)),
+        ),
         versions=versions(),
         recipe=yaml_file.dump(binding.unbind(recipe)),
         last_shift_m=last_shift_m(rounds, component),

@@ -38,6 +38,9 @@ REFINEMENTS: dict[str, Outcome] = {
 DOUBTS = {
     "images missing": "{count} of {detail} are missing",
     "other scale": "in another scale than the truth",
+    "truth convention": "the truth seems to be in another convention",
+    "truth clock": "{detail}",
+    "truth unlike": "still poses would explain the registered motion better than the truth",
     "unsettled": "not settled",
     "tracking lost": "tracking was lost at {count} of {frames} frames",
 }

@@ -33,6 +33,8 @@ INPUTS = {
     "other scale": "The true path is {detail} times as large as this one: depth is read in the wrong unit (--set "
     "source.reader.depth_scale), or with another camera's focal length, or the truth is not in metres, or not of the "
     "camera.",
+    "truth convention": "{detail}",
+    "truth clock": "{detail}: shift them in its file",
     "single frame": "{detail}: has a single frame: there is nothing to register, the model is that frame alone",
 }
 """What may be wrong with the input: the sentence of each kind of note; `{count}` and `{detail}` are the note's, and of
@@ -50,6 +52,8 @@ DOUBTS = {
     "two scales, or depth is warped, and nothing here tells which is right.",
     "given unlike": "The poses given miss {detail} of the registered motion (median), more than still ones would, and "
     "no other convention explains them: are they of this camera, of these frames, and on their clock?",
+    "truth unlike": "The true poses miss {detail} of the registered motion (median), more than still ones would, and "
+    "no other convention or clock explains them: are they of this camera, and of these frames?",
     "mostly untested": "{count} of {detail}.",
     "frames outside": "{count} of {detail} frames are from before the first given pose or after the last one: are they "
     "of another clock, or another path?",
