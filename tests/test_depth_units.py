@@ -11,7 +11,8 @@ import pytest
 
 from hodge_adapters.seven_scenes.reader import SevenScenesReader
 from hodge_adapters.tum.reader import TumReader
-from hodge_pipeline.sources.depth_units import PRIMESENSE_STEP, depth_doubts, doubts_of, inverse_step
+from hodge_pipeline.sources.colour_on_depth import image_doubts
+from hodge_pipeline.sources.depth_units import PRIMESENSE_STEP, doubts_of, inverse_step
 from hodge_pipeline.types import Floats32, Frame
 
 PIXELS = 20
@@ -64,11 +65,11 @@ def test_a_kinect_in_another_unit_is_told(factor: float, kind: str) -> None:
 )
 def test_a_real_kinect(scale: float, kind: str, data_dir: Path) -> None:
     frames = TumReader(depth_scale=scale).open(data_dir / "tum/fr1_rpy_part").frames
-    assert [note.kind for note in depth_doubts(frames)] == ([kind] if kind else [])
+    assert [note.kind for note in image_doubts(frames)] == ([kind] if kind else [])
 
 
 def test_a_real_kinect_of_millimetres(data_dir: Path) -> None:
-    assert depth_doubts(SevenScenesReader().open(data_dir / "seven_scenes/redkitchen").frames) == ()
+    assert image_doubts(SevenScenesReader().open(data_dir / "seven_scenes/redkitchen").frames) == ()
 
 
 def test_what_lies_too_near_or_too_far_is_asked_about() -> None:
@@ -86,5 +87,5 @@ def test_images_that_cannot_be_read_are_passed_over() -> None:
         raise OSError("gone")
 
     near = Frame(0, 0.0, read_depth=partial(np.full, (3, 4), 0.4, np.float32))
-    assert len(depth_doubts([near, replace(near, read_depth=unreadable)])) == 1
-    assert depth_doubts([replace(near, read_depth=unreadable), replace(near, read_depth=None)]) == ()
+    assert len(image_doubts([near, replace(near, read_depth=unreadable)])) == 1
+    assert image_doubts([replace(near, read_depth=unreadable), replace(near, read_depth=None)]) == ()

@@ -340,9 +340,14 @@ def test_lists_of_numbers_take_the_stamps_in_the_names_of_the_images(tmp_path: P
 
 @pytest.mark.parametrize("name", ["fr1_rpy_part", "rgbd_dataset_freiburg1_xyz_60"])
 def test_a_renamed_folder_is_known_by_its_stamps(name: str, data_dir: Path, tmp_path: Path) -> None:
-    source = TumReader().open(linked(data_dir / "tum" / name, tmp_path))
+    for folder in (mine := tmp_path / "mine", other := tmp_path / "freiburg3"):
+        folder.mkdir()
+        linked(data_dir / "tum" / name, folder)
+    source = TumReader().open(mine)
     assert source.frames[0].camera.fx == 517.3
     assert any("intrinsics of fr1 taken: by the day of the stamps" in note for note in source.notes)
+    (doubt,) = map(str, TumReader().open(other).doubts)
+    assert doubt.startswith("the folder's name says fr3, but the day of the stamps, 2011-05-10, is fr1's: set source.")
 
 
 @pytest.mark.parametrize("name", ["fr1_rpy_part", "rgbd_dataset_freiburg1_xyz_60"])

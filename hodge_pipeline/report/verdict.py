@@ -54,6 +54,7 @@ REASONS = {
     "mostly untested": "most of the poses given have no frame",
     "frames outside": "most frames lie outside the time of the poses given",
     "depth unit": "depth is probably not in metres",
+    "colour beside depth": "depth seems not to be registered to colour",
     "focal length": "images contradict the camera's focal length",
     "millimetres": "its unit looks like the millimetre",
     "left apart": "a guess joins what tracking left apart",

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Floats, Floats32, Frame
-from hodge_pipeline.types.arrays import evenly
+from hodge_pipeline.types import Floats
 from hodge_pipeline.types.notes import Note
 
 SAMPLED_FRAMES = 8
@@ -33,21 +30,6 @@ FEWEST_PIXELS, FEWEST_VALUES, ROUNDINGS = 5, 20, 5
 """Pixels that a value needs to count; steps needed; their least length in units of the stored number."""
 WHOLE, MOSTLY = 0.15, 0.9
 """Distance of a step from a whole multiple of the base step, at most, and the share of steps that must keep it."""
-
-
-def depth_doubts(frames: Sequence[Frame]) -> tuple[Note, ...]:
-    """Notes on depth that seems not to be in metres, by a few depth images, evenly over the sequence.
-
-    An image that cannot be read is left to whoever reads it next.
-    """
-    readers = [frame.read_depth for frame in frames if frame.read_depth is not None]
-    values: list[Floats32] = []
-    for row in evenly(len(readers), SAMPLED_FRAMES):
-        try:
-            values.append(readers[row]().ravel())
-        except (SourceError, OSError):
-            continue
-    return doubts_of(np.concatenate(values)) if values else ()
 
 
 def doubts_of(depth_m: NDArray[np.floating[Any]]) -> tuple[Note, ...]:

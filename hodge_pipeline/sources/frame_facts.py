@@ -10,6 +10,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.sources.colour_on_depth import Agreement, agreement, colour_doubts
 from hodge_pipeline.sources.depth_units import PLAUSIBLE_DEPTH_M, SAMPLED_FRAMES, doubts_of
 from hodge_pipeline.types import Bools, Camera, Floats, Floats32, Frame, PointCloud, Trajectory
 from hodge_pipeline.types.arrays import evenly
@@ -185,6 +186,7 @@ def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]
     """Depth range and invalid share of a few frames, evenly over the sequence, and their images that cannot be read."""
     with_depth = [frame for frame in frames if frame.read_depth is not None or frame.read_points is not None]
     depths, faults, lost_of = list[Floats32](), list[str](), dict[str, float]()
+    edges = list[Agreement]()
     for row in evenly(len(with_depth), SAMPLED_FRAMES):
         frame = with_depth[row]
         try:
@@ -193,7 +195,7 @@ def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]
         except (SourceError, OSError) as error:
             faults.append(str(error))
             continue
-        faults += _colour_fault(frame)
+        edges += _colour_edges(frame, depth, faults)
         share = float((depths[-1] <= 0).mean()) if depths[-1].size else 1.0
         if share > MOSTLY_EMPTY and frame.read_depth is not None:
             oddities.append(f"frame {frame.frame_id}: {share:.0%} of its pixels have no depth")
@@ -208,7 +210,7 @@ def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]
     valid = values[values > 0]
     median = float(np.median(valid)) if len(valid) else None
     if with_depth and with_depth[0].read_depth is not None:
-        oddities.extend(str(doubt) for doubt in doubts_of(valid))
+        oddities.extend(str(doubt) for doubt in (*doubts_of(valid), *colour_doubts(edges)))
     elif median is not None and not PLAUSIBLE_DEPTH_M[0] < median < PLAUSIBLE_DEPTH_M[1]:
         oddities.append(f"the median distance is {median:.3g} m: are the points in metres?")
     return {
@@ -232,13 +234,14 @@ def _depth(frame: Frame) -> tuple[Floats32, float]:
     return distances, cloud.no_numbers / max(len(cloud) + cloud.no_numbers, 1)
 
 
-def _colour_fault(frame: Frame) -> list[str]:
+def _colour_edges(frame: Frame, depth_m: Floats32, faults: list[str]) -> list[Agreement]:
+    """How edges of colour agree with those of depth; a colour image that cannot be read goes to the faults."""
     try:
-        if frame.read_colour is not None:
-            frame.read_colour()
+        colour = None if frame.read_colour is None else frame.read_colour()
     except (SourceError, OSError) as error:
-        return [str(error)]
-    return []
+        faults.append(str(error))
+        return []
+    return [] if colour is None or frame.read_depth is None else agreement(depth_m, colour)
 
 
 def listed(names: Sequence[object]) -> str:

@@ -16,7 +16,7 @@ from hodge_pipeline.recording.run import Recording
 from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.report import run_files
 from hodge_pipeline.run_folder import Run, check_layout, end
-from hodge_pipeline.sources.depth_units import depth_doubts
+from hodge_pipeline.sources.colour_on_depth import image_doubts
 from hodge_pipeline.sources.lacking import lacking
 from hodge_pipeline.sources.opening import Fingerprints, changed_since, fingerprints, open_with_reader, remembered
 from hodge_pipeline.start.truth import with_truth
@@ -124,7 +124,7 @@ class _Run:
         if not source.frames:
             raise SourceError(f"{path}: has no frames to register: give a sequence with depth or clouds")
         self.store.note(*notes_of("reader", source.notes), *source.doubts)
-        self.store.note(*depth_doubts(source.frames), *lacking(source))
+        self.store.note(*image_doubts(source.frames), *lacking(source))
         if len(source.frames) == 1:
             self.store.note(Note("single frame", detail=str(path)))
         prints = fingerprints(source.files, strict=self.strict)

@@ -144,13 +144,18 @@ class TumReader:
         file = find_camera_file(path) if self.camera == "auto" else path / self.camera
         if file:
             return self._from_file(file, notes)
+        days = {str(day) for day in np.asarray(listing.stamps_s, "datetime64[s]").astype("datetime64[D]")}
+        dated = next((name for name, recorded in RECORDED_ON.items() if recorded & days), None)
         match = _FREIBURG.search(path.resolve().name)
         if match:
             name = f"fr{match[1] or match[2]}"
             notes.append(f"intrinsics of {name} taken: by the folder's name")
+            if dated and dated != name:
+                told = (
+                    f"the folder's name says {name}, but the day of the stamps, {', '.join(sorted(days))}, is {dated}'s"
+                )
+                doubts.append(Note("reader's doubt", detail=f"{told}: set source.reader.camera={dated} if it was"))
             return CAMERAS[name], ()
-        days = {str(day) for day in np.asarray(listing.stamps_s, "datetime64[s]").astype("datetime64[D]")}
-        dated = next((name for name, recorded in RECORDED_ON.items() if recorded & days), None)
         if dated:
             notes.append(f"intrinsics of {dated} taken: by the day of the stamps, {', '.join(sorted(days))}")
             return CAMERAS[dated], ()
