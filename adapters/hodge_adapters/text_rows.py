@@ -91,14 +91,15 @@ def natural(name: str) -> tuple[tuple[int, int, str], ...]:
 
 
 def inside(folder: Path, name: str) -> Path | None:
-    """The path of a file named in a list, or None for one that leaves the folder by `..` or an absolute path, or has a
-    longer name than file systems allow.
+    """The path of a file named in a list, or None for one that leaves the folder by `..` or an absolute path out of it,
+    or has a longer name than file systems allow.
 
     Links inside the folder are the user's own and are followed.
     """
     pure = PurePosixPath(name.replace("\\", "/"))
     too_long = len(name) > MAX_PATH or any(len(part.encode("utf-8", "replace")) > MAX_NAME_BYTES for part in pure.parts)
-    return None if pure.is_absolute() or ".." in pure.parts or too_long else folder / pure
+    leaves = pure.is_absolute() and not pure.is_relative_to(folder.absolute())
+    return None if leaves or ".." in pure.parts or too_long else folder / pure
 
 
 def write_text_atomically(path: Path, text: str) -> None:

@@ -165,8 +165,9 @@ def _read_list(path: Path, notes: list[str]) -> tuple[Floats, list[Path], Ints]:
     outside: list[int] = []
     for row in read_rows(path):
         stamp_s = _stamp(row, 0)
-        image = inside(path.parent, row.fields[1]) if len(row.fields) > 1 else None
-        if stamp_s is None or len(row.fields) != 2:
+        image = inside(path.parent, " ".join(row.fields[1:]).strip('"')) if len(row.fields) > 1 else None
+        has_blanks = len(row.fields) > 2 and image is not None and image.is_file()
+        if stamp_s is None or (len(row.fields) != 2 and not has_blanks):
             unreadable.append(row.line)
         elif image is None:
             outside.append(row.line)
@@ -199,9 +200,11 @@ def _from_association(path: Path, notes: list[str]) -> StampedImages:
             outside.append(row.line)
         else:
             found.append((stamp_s, depth, colour, colour_stamp_s))
-    notes += _left_out(path.name, "`stamp file stamp file`", unreadable, outside)
+    left_out = _left_out(path.name, "`stamp file stamp file`", unreadable, outside)
+    notes += left_out
     if not found:
-        raise SourceError(f"{path}: no line `stamp file stamp file` that can be used in it: mend or remove the file")
+        why = f" ({'; '.join(left_out)})" if left_out else ""
+        raise SourceError(f"{path}: no line `stamp file stamp file` that can be used in it{why}: mend or remove it")
     stamps_s, order, runs = _in_order(np.array([stamp for stamp, *_ in found]), path.name, notes)
     colour_stamps_s = in_seconds(np.array([found[row][3] for row in order]), path.name, [])
     delays_s = np.where(abs(colour_stamps_s - stamps_s) <= LONGEST_DELAY_S, colour_stamps_s - stamps_s, 0.0)
