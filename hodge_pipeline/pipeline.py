@@ -16,8 +16,8 @@ from hodge_pipeline.executors.dask import open_workers
 from hodge_pipeline.fusion.fuse import fuse_all
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.recording.run import Recording
-from hodge_pipeline.refine import verdict
-from hodge_pipeline.refine.verdict import Refined
+from hodge_pipeline.refine import given_poses
+from hodge_pipeline.refine.given_poses import Refined
 from hodge_pipeline.rounds.all_frames import pose_all_frames
 from hodge_pipeline.rounds.by_hand import edited_rounds
 from hodge_pipeline.rounds.one_round import Registered, Work
@@ -73,7 +73,7 @@ def compute(job: Job, recording: Recording) -> Computed:
         recording.diagnosis(rounds[-1])
         scores = score(job, work, rounds)
         recording.scores(scores)
-        refined = verdict.finish(work, job.folder, rounds) if scene.is_given else None
+        refined = given_poses.finish(work, job.folder, rounds) if scene.is_given else None
         poses = final_poses(work, rounds[-1], refined)
     models = fuse_all(recipe.fusion, scene, poses, store, keys_only=job.again and rounds[-1].edited)
     recording.models(models)

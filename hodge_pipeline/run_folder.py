@@ -16,7 +16,7 @@ from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.fusion.fuse import fuse
 from hodge_pipeline.recipe.scale import scale_of_scans, scaled_recipe
 from hodge_pipeline.recipe.schema import Recipe, recipe_of_run
-from hodge_pipeline.refine.verdict import Refined
+from hodge_pipeline.refine.given_poses import Refined
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.notebook import as_html
 from hodge_pipeline.rounds.all_frames import pose_frames

@@ -13,7 +13,7 @@ import pytest
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.evaluation.residuals import with_residuals
 from hodge_pipeline.pairs.edits import listed_edges
-from hodge_pipeline.refine.verdict import held_out_pairs
+from hodge_pipeline.refine.given_poses import held_out_pairs
 from hodge_pipeline.scene import Round
 from hodge_pipeline.store import codec
 from hodge_pipeline.store.edge_table import COLUMNS, read_edges, write_edges

@@ -12,11 +12,11 @@ import pytest
 from hodge_pipeline import se3
 from hodge_pipeline.refine.candidates import CandidateModel, CandidateSet
 from hodge_pipeline.refine.choice import UNTOLD, Choice, choose, refused_doubt
-from hodge_pipeline.refine.judge import costs
 from hodge_pipeline.refine.model import _metric_poses
+from hodge_pipeline.refine.reprojection_cost import costs
 from hodge_pipeline.refine.uncertainty import loose, told_apart
 from hodge_pipeline.types import Floats, ModelQuality
-from test_refine_judge import flat, quality
+from test_reprojection_cost import flat, quality
 
 DEPTHS = np.linspace(1.0, 3.0, 20)
 NO_STEPS: Any = None

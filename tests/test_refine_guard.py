@@ -8,10 +8,10 @@ from typer.testing import CliRunner
 
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
-from hodge_pipeline.refine import verdict
+from hodge_pipeline.refine import given_poses
+from hodge_pipeline.refine.given_poses import chi2_measure, first_as_good, spread_corrections
 from hodge_pipeline.refine.guard import Measure, PoseChange, decide
 from hodge_pipeline.refine.path_size import path_size
-from hodge_pipeline.refine.verdict import chi2_measure, first_as_good, spread_corrections
 from hodge_pipeline.scene import KeyFrames
 from hodge_pipeline.types.notes import Note
 
@@ -71,7 +71,7 @@ def test_poses_that_the_last_round_still_moved_are_worse(shift_m: float, settled
         positions = np.outer(np.arange(4.0), [1.0, 0, 0]) + np.outer([1, -1, -1, 1], [0, bend_m, 0]) / 2
         poses = se3.from_parts(np.broadcast_to(np.eye(3), (4, 3, 3)), positions)
         rounds.append(SimpleNamespace(world_from_cam=poses, graph=graph, edited=False))
-    measures = verdict._settled(work, rounds)
+    measures = given_poses._settled(work, rounds)
     assert (not measures) == settled
     assert decide([BETTER, *measures], MOVED).outcome == ("refined" if settled else "worse")
 

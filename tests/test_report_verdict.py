@@ -13,7 +13,7 @@ import pytest
 from hodge_pipeline.evaluation.difference import MEASURABLE, Change, sign_of
 from hodge_pipeline.evaluation.residuals import with_residuals
 from hodge_pipeline.refine.guard import Decision, Measure
-from hodge_pipeline.refine.judge import Cost
+from hodge_pipeline.refine.reprojection_cost import ReprojectionCost
 from hodge_pipeline.report.brief import brief
 from hodge_pipeline.report.contents import (
     Path3D,
@@ -82,7 +82,7 @@ def test_a_largest_error_that_got_worse_is_named_too() -> None:
 
 
 def test_tracks_that_contradict_each_other_are_said_first() -> None:
-    good = Cost(0.9, 0.5, 4.0, 1000, 0, 0, 0.0, (), (), np.ones(1000, bool))
+    good = ReprojectionCost(0.9, 0.5, 4.0, 1000, 0, 0, 0.0, (), (), np.ones(1000, bool))
     assert not good.doubt
     decision = Decision("refined", "mean error 67 -> 24.1 px", doubt=replace(good, px=24.1, cap_px=60.0).doubt)
     verdict = judge(replace(told((0.5, 0.020), (0.4, 0.017)), refinement=summary(decision)))

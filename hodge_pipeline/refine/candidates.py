@@ -10,10 +10,10 @@ import numpy as np
 
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.refine.frame import in_frame_of
-from hodge_pipeline.refine.judge import SAME_COST, Cost, best, costs
 from hodge_pipeline.refine.model_edges import DepthEdges, depth_edges, no_depth_edges
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_solve import Solved, position_priors, solve_bodies
+from hodge_pipeline.refine.reprojection_cost import SAME_COST, ReprojectionCost, best, costs
 from hodge_pipeline.stages import Step, Steps, TrackedModel, Workers
 from hodge_pipeline.types import Bools, Floats, PositionPriors, ViewGraph
 
@@ -46,9 +46,9 @@ class CandidateSet:
     was not needed or no edge was measured.
     """
 
-    inputs: Cost
+    inputs: ReprojectionCost
     candidates: Sequence[CandidateModel]
-    costs: Sequence[Cost]
+    costs: Sequence[ReprojectionCost]
     solved: Solved | None
     depth: DepthEdges
     notes: tuple[str, ...]

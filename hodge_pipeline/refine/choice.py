@@ -12,7 +12,7 @@ from hodge_pipeline.evaluation.scores import SIGMA_M
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.refine.candidates import CandidateSet
 from hodge_pipeline.refine.guard import SCORE_TOLERANCE, Measure
-from hodge_pipeline.refine.judge import best, degrees_of_freedom, mends
+from hodge_pipeline.refine.reprojection_cost import best, degrees_of_freedom, mends
 from hodge_pipeline.refine.uncertainty import told_apart
 from hodge_pipeline.stages import Adjusted, Step, Steps, TrackedModel
 from hodge_pipeline.types import Floats

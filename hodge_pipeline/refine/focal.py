@@ -7,7 +7,7 @@ from typing import Literal
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.difference import alike
 from hodge_pipeline.refine.candidates import CandidateSet, adjusted_model
-from hodge_pipeline.refine.judge import costs, degrees_of_freedom
+from hodge_pipeline.refine.reprojection_cost import costs, degrees_of_freedom
 from hodge_pipeline.stages import Steps, TrackedModel
 
 FREE: dict[Literal["rig", "focal", "all"], tuple[str, str, float]] = {

@@ -16,11 +16,11 @@ from hodge_pipeline.refine.choice import Choice, choose, held_out_score, refused
 from hodge_pipeline.refine.focal import intrinsics_doubt
 from hodge_pipeline.refine.frame import in_frame_of
 from hodge_pipeline.refine.guard import Decision, Measure, PoseChange
-from hodge_pipeline.refine.judge import SAME_COST, Cost, named, spoilt_doubt
 from hodge_pipeline.refine.model_edges import held_out_distances
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_solve import Solved
 from hodge_pipeline.refine.pieces import pieces_doubt
+from hodge_pipeline.refine.reprojection_cost import SAME_COST, ReprojectionCost, named, spoilt_doubt
 from hodge_pipeline.refine.scale import Scale, metric_scale
 from hodge_pipeline.refine.uncertainty import SIGMAS, loose, moves
 from hodge_pipeline.stages import Steps, TrackedModel, Workers
@@ -48,7 +48,7 @@ class RefinedModel:
     model: TrackedModel
     scales: tuple[Scale, ...]
     final_scale: Scale
-    candidates: tuple[tuple[str, Cost], ...]
+    candidates: tuple[tuple[str, ReprojectionCost], ...]
     kept_row: int
     solved: Solved | None
     decision: Decision
@@ -192,7 +192,7 @@ def _decision(found: CandidateSet, choice: Choice, scales: Sequence[Scale], forc
     return Decision("forced", f"{choice.reason}; {told}") if choice.reason else Decision("refined", told)
 
 
-def _join_decision(apart: Cost, joined: Cost, name: str, force: bool) -> Decision:
+def _join_decision(apart: ReprojectionCost, joined: ReprojectionCost, name: str, force: bool) -> Decision:
     """Whether one model replaces several: it fits hardly worse than these apart, and puts no more images off."""
     told = f"mean error {apart.px:.4g} px apart, {joined.px:.4g} px as one{_by(name)}"
     if joined.px <= (1 + JOIN_LOSS) * apart.px and len(joined.images_off) <= len(apart.images_off):

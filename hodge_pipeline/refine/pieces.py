@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.refine.judge import named
+from hodge_pipeline.refine.reprojection_cost import named
 from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.types import Bools
 

@@ -13,7 +13,7 @@ from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.refine.guard import Measure
-from hodge_pipeline.refine.judge import Cost
+from hodge_pipeline.refine.reprojection_cost import ReprojectionCost
 from hodge_pipeline.report.document import Picture
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 from hodge_pipeline.types.notes import Note
@@ -175,7 +175,7 @@ class RefinementSummary:
     measures: tuple[Measure, ...] = ()
     change: str = ""
     scale: str = ""
-    candidates: tuple[tuple[str, Cost], ...] = ()
+    candidates: tuple[tuple[str, ReprojectionCost], ...] = ()
     kept: int = 0
     doubt: str = ""
 

@@ -11,7 +11,7 @@ import numpy as np
 from hodge_pipeline import registry
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.recipe.schema import Recipe
-from hodge_pipeline.refine.verdict import Refined
+from hodge_pipeline.refine.given_poses import Refined
 from hodge_pipeline.report import known_positions
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.run_report import make_report

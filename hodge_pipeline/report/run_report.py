@@ -15,7 +15,7 @@ from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe import binding
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.recording.shapes import is_scanner
-from hodge_pipeline.refine.verdict import Refined
+from hodge_pipeline.refine.given_poses import Refined
 from hodge_pipeline.report.contents import (
     EdgeRow,
     LoopRow,

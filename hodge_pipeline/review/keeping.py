@@ -10,7 +10,7 @@ import numpy as np
 from hodge_pipeline import registry
 from hodge_pipeline.errors import not_written
 from hodge_pipeline.pairs.edits import FILE, write_history_file
-from hodge_pipeline.refine.judge import SAME_COST, costs
+from hodge_pipeline.refine.reprojection_cost import SAME_COST, costs
 from hodge_pipeline.review.session import Session
 from hodge_pipeline.review.subject import SIDE_FILE, Subject
 from hodge_pipeline.stages import TrackedModel

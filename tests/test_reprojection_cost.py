@@ -13,7 +13,7 @@ import hodge_pipeline
 from hodge_adapters.colmap.models import ColmapModels
 from hodge_adapters.colmap.uncertainty import standard_errors
 from hodge_pipeline import se3
-from hodge_pipeline.refine.judge import best, costs, mends, spoilt_doubt
+from hodge_pipeline.refine.reprojection_cost import best, costs, mends, spoilt_doubt
 from hodge_pipeline.types import ModelQuality
 from test_refine_colmap import FREE, noisy
 

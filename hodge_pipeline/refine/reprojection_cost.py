@@ -1,4 +1,4 @@
-"""The robust cost of every candidate of a refined model, on the same observations, and which one costs least."""
+"""The capped reprojection cost of every candidate of a refined model, on the same observations, and the cheapest."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _COLUMNS = ("errors_px", "parallaxes_deg", "track_lengths")
 
 
 @dataclass(frozen=True)
-class Cost:
+class ReprojectionCost:
     """How well the observations fit one candidate.
 
     - `px`: the mean reprojection error, each capped at `cap_px`; one that is lost, behind its camera or without the
@@ -82,7 +82,7 @@ class Cost:
         return not self.images_off and self.beyond <= SOUND_SHARE and not self.doubt
 
 
-def costs(inputs: Sequence[ModelQuality], candidates: Sequence[ModelQuality]) -> list[Cost]:
+def costs(inputs: Sequence[ModelQuality], candidates: Sequence[ModelQuality]) -> list[ReprojectionCost]:
     """The cost of the inputs together, then of each candidate, on the inputs' observations of points in two images up.
 
     An observation of a point in n images weighs (2 n − 3) / 2 n, the share of its numbers that the point leaves to test
@@ -104,11 +104,13 @@ def costs(inputs: Sequence[ModelQuality], candidates: Sequence[ModelQuality]) ->
     return _costs(errors_px[:, informed], distant[:, informed], weights[informed], keys[informed] >> 32, names)
 
 
-def _costs(errors_px: Floats, distant: Bools, weights: Floats, image: Ints, names: Sequence[str]) -> list[Cost]:
+def _costs(
+    errors_px: Floats, distant: Bools, weights: Floats, image: Ints, names: Sequence[str]
+) -> list[ReprojectionCost]:
     """The costs of C candidates by `errors_px`, `distant (C, N)` of N observations, of the images `image (N,)`."""
     if not len(weights):
         nan = float("nan")
-        return [Cost(nan, nan, nan, 0, 0, 0, 1.0, (), (), np.zeros(0, bool)) for _ in errors_px]
+        return [ReprojectionCost(nan, nan, nan, 0, 0, 0, 1.0, (), (), np.zeros(0, bool)) for _ in errors_px]
     behind = np.isinf(errors_px)
     effective = np.where(distant | behind, np.inf, errors_px)
     medians = np.median(effective, axis=1)
@@ -120,7 +122,7 @@ def _costs(errors_px: Floats, distant: Bools, weights: Floats, image: Ints, name
         share = np.bincount(image, beyond, minlength=len(names)) / np.maximum(total, 1)
         capped = np.minimum(errors, cap_px)
         out.append(
-            Cost(
+            ReprojectionCost(
                 px=float(weights @ capped / weights.sum()),
                 median_px=float(min(medians[row], cap_px)),
                 cap_px=cap_px,
@@ -136,7 +138,7 @@ def _costs(errors_px: Floats, distant: Bools, weights: Floats, image: Ints, name
     return out
 
 
-def mends(before: Cost, after: Cost) -> bool:
+def mends(before: ReprojectionCost, after: ReprojectionCost) -> bool:
     """Whether a candidate brings more observations within the cap than it takes beyond it, by more than chance would,
     and puts no image off; both of the same `costs`.
     """
@@ -146,7 +148,7 @@ def mends(before: Cost, after: Cost) -> bool:
     return mended > spoilt and bool(bdtrc(mended - 1, mended + spoilt, 0.5) < BY_CHANCE)
 
 
-def spoilt_doubt(before: Cost, after: Cost) -> str:
+def spoilt_doubt(before: ReprojectionCost, after: ReprojectionCost) -> str:
     """Why a candidate of lower cost may be wrong: it takes more observations beyond the cap than sound models have
     there, as where half of a scene is laid on a copy of itself; "" where it does not. Both of the same `costs`.
     """
@@ -170,7 +172,7 @@ def named(images: Sequence[str]) -> str:
     return f"{counted(len(images), 'image')} ({shown})"
 
 
-def best(found: Sequence[Cost]) -> int:
+def best(found: Sequence[ReprojectionCost]) -> int:
     """The row of the lowest cost, the first of those of the same optimum; 0 where no cost is finite."""
     px = np.array([cost.px for cost in found])
     return int(np.flatnonzero(px <= (1 + SAME_COST) * np.nanmin(px))[0]) if np.isfinite(px).any() else 0
