@@ -19,7 +19,8 @@ from hodge_adapters.seven_scenes.reader import SevenScenesReader
 from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.pairs.drift import DriftEdges
 from hodge_pipeline.pairs.overlap import OverlapEdges
-from hodge_pipeline.registration.clouds import CloudOptions, prepare_clouds
+from hodge_pipeline.registration.cloud_set import prepare_clouds
+from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.global_landmarks import LandmarkConsensus
 from hodge_pipeline.registration.global_pairs import describe_clouds, match_pairs
 from hodge_pipeline.registration.global_registrars import FpfhConsensus

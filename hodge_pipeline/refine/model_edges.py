@@ -9,7 +9,8 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.scores import edge_distances
 from hodge_pipeline.refine.model_options import ModelRefinement
-from hodge_pipeline.registration.clouds import CloudOptions, prepare_clouds
+from hodge_pipeline.registration.cloud_set import prepare_clouds
+from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.register import register_edges
 from hodge_pipeline.stages import Step, Steps, TrackedModel, Workers
 from hodge_pipeline.store.codec import CLOUDS
@@ -72,7 +73,9 @@ def depth_clouds(
     model: TrackedModel, images: Ints, options: CloudOptions, *, workers: Workers, step: Step
 ) -> tuple[CloudSet, tuple[str, ...]]:
     """Step: the clouds of the images (D,) with depth, and notes on odd ones."""
-    return prepare_clouds([model.frames[row] for row in images], options, workers, step.folder / CLOUDS, step.advance)
+    frames = [model.frames[row] for row in images]
+    clouds, notes = prepare_clouds(frames, options, workers, step.folder / CLOUDS, step.advance)
+    return clouds, tuple(map(str, notes))
 
 
 def held_out(count: int, share: float, seed: int) -> Bools:

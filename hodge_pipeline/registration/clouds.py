@@ -1,11 +1,9 @@
-"""From a frame to its down-sampled cloud with normals, and from all frames to one `CloudSet`."""
+"""From a frame to its down-sampled cloud with normals, and what is odd about it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -15,16 +13,15 @@ from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.registration.voxel_means import voxel_means
-from hodge_pipeline.stages import Advance, Workers, in_order, no_progress
-from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats, Floats32, Frame, Landmarks, PointCloud
+from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats32, Frame, Landmarks, PointCloud
 from hodge_pipeline.types.text import counted
 
-FRAMES_IN_BLOCK = 16
 MIN_POINTS_FOR_NORMALS = 5
+"""Three lie in a plane whatever they are."""
 NORMAL_NEIGHBOURS = 10
 """In the plane fit of a normal: as in the paper."""
 MANY_POINTS = 5_000_000
-LISTED_NOTES = 5
+"""Measurements of a frame from which it is told that the cloud keeps fewer: more than a depth image has."""
 MAP_AWAY = 10.0
 """A cloud whose median range is this many times its extent is in map coordinates, not in the sensor's axes."""
 MAX_VOXELS_ALONG_AXIS = 2_000_000  # its cube still fits the 64-bit voxel key
@@ -35,7 +32,8 @@ FEW_PIXELS = 0.02
 """Share of the pixels ignored at either end of that span: the black rim of an undistorted image is a hundredth."""
 BLANK_STRIDE = 4
 """Every so many rows and columns are tested."""
-BLANK = "its depth is sound, but its colour image shows nothing: black, or of one even colour"
+REACH_QUANTILE, REACH_POINTS = 0.99, 100_000
+"""The reach of a scan is that of 99 % of its points, told by so many."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -82,13 +80,6 @@ class CloudOptions:
     def stride_of(self, camera: Camera) -> int:
         """The stride, in rows and columns, at which this camera's depth images are sampled."""
         return min(self.stride, max(1, round(abs(camera.fx) * self.voxel_m / self.max_range_m)))
-
-
-REACH_QUANTILE, REACH_POINTS = 0.99, 100_000
-"""The reach of a scan is that of 99 % of its points, told by so many."""
-FACTOR_OF_UNITS = 50.0
-"""Scans of one scene differ less in reach; millimetres and metres differ by 1000."""
-OTHER_UNITS = "it seems to have other units"
 
 
 class Oddity(NamedTuple):
@@ -166,68 +157,6 @@ def _landmarks(frame: Frame, options: CloudOptions) -> Landmarks:
         return Landmarks.none()
 
 
-def prepare_clouds(
-    frames: Sequence[Frame], options: CloudOptions, workers: Workers, folder: Path, advance: Advance = no_progress
-) -> tuple[CloudSet, tuple[str, ...]]:
-    """The clouds of all frames, in their order, in a folder, and notes on those that gave none, or a cloud that is odd.
-
-    A frame that cannot be read gets an empty cloud. Raises `SourceError` where no frame gave a single point.
-    """
-    every: list[CloudCounts] = []
-
-    def counted_in(block: tuple[CloudSet, list[CloudCounts]]) -> CloudSet:
-        every.extend(block[1])
-        advance(len(block[1]))
-        return block[0]
-
-    made = workers.map(partial(_make_block, options=options), in_blocks(frames))
-    clouds = CloudSet.write(folder, map(counted_in, in_order(made)))
-    odd = [counts.odd for counts in every if counts.odd is not None]
-    if not any(counts.points for counts in every):
-        reason = odd[0] if odd else "the source has no frames"
-        raise no_clouds(frames, reason)
-    odd += [Oddity(frame.frame_id, BLANK) for frame, counts in zip(frames, every, strict=True) if counts.blank]
-    odd += _of_other_units(frames, np.array([counts.reach_m for counts in every]))
-    return clouds, shortened(odd) + _no_returns(every)
-
-
-def _of_other_units(frames: Sequence[Frame], reach_m: Floats) -> list[Oddity]:
-    usual = float(np.nanmedian(reach_m)) if np.isfinite(reach_m).any() else np.nan
-    odd = np.flatnonzero((reach_m > FACTOR_OF_UNITS * usual) | (reach_m < usual / FACTOR_OF_UNITS))
-    todo = "write it in those of the others (the reader's units_per_metre is 1000 for millimetres, but holds for all)"
-    return [
-        Oddity(frames[row].frame_id, OTHER_UNITS, f"it reaches {reach_m[row]:.3g} m, the others {usual:.3g} m: {todo}")
-        for row in odd.tolist()
-    ]
-
-
-def in_blocks(frames: Sequence[Frame]) -> list[Sequence[Frame]]:
-    """The frames in blocks for workers."""
-    return [frames[start : start + FRAMES_IN_BLOCK] for start in range(0, len(frames), FRAMES_IN_BLOCK)]
-
-
-def no_clouds(frames: Sequence[Frame], first: object) -> SourceError:
-    """What to say where no frame gave a point; `first`: what was wrong with the first of them."""
-    if frames and not any(frame.read_points or (frame.read_depth and frame.camera) for frame in frames):
-        return SourceError(
-            "no frame has depth with a camera, or points, so that there is nothing to register: hodge inspect says "
-            "what the source is good for"
-        )
-    return SourceError(
-        f"none of the {len(frames)} frames gave a point cloud: hodge inspect shows size and range of their depth; the "
-        f"first: {first}"
-    )
-
-
-def _no_returns(every: Sequence[CloudCounts]) -> tuple[str, ...]:
-    """The note that counts the points of scans that are no returns, where there are any."""
-    lost = sum(counts.no_returns for counts in every)
-    if not lost:
-        return ()
-    looked_at = sum(counts.looked_at for counts in every)
-    return (f"{lost} of {looked_at} points ({lost / looked_at:.1%}) are no returns (zero, or no number): left out",)
-
-
 def is_blank(image: Bytes) -> bool:
     """Whether an image, (H, W) or (H, W, 3), is black or of one even colour, but for `FEW_PIXELS`.
 
@@ -243,31 +172,14 @@ def is_blank(image: Bytes) -> bool:
     return True
 
 
-def shortened(odd: Sequence[Oddity]) -> tuple[str, ...]:
-    """A note for each oddity: of many with the same `what` the first ones, and how many more there are."""
-    alike: dict[str, list[Oddity]] = {}
-    for one in odd:
-        alike.setdefault(one.what, []).append(one)
-    more = tuple(
-        f"{len(same) - LISTED_NOTES} more frames: {what}, as of those before"
-        for what, same in alike.items()
-        if len(same) > LISTED_NOTES
-    )
-    return tuple(str(one) for same in alike.values() for one in same[:LISTED_NOTES]) + more
-
-
-def _make_block(frames: Sequence[Frame], options: CloudOptions) -> tuple[CloudSet, list[CloudCounts]]:
-    made = [_make_or_report(frame, options) for frame in frames]
-    return CloudSet.from_clouds([cloud for cloud, _ in made]), [counts for _, counts in made]
-
-
 def cloud_or_note(frame: Frame, options: CloudOptions) -> tuple[PointCloud, str]:
     """The cloud of a frame and a note, empty where all is well; an empty cloud where it cannot be read."""
-    cloud, counts = _make_or_report(frame, options)
+    cloud, counts = make_or_report(frame, options)
     return cloud, "" if counts.odd is None else str(counts.odd)
 
 
-def _make_or_report(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCounts]:
+def make_or_report(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCounts]:
+    """The cloud as of `make_cloud`; an empty one, and why, where the frame cannot be read."""
     try:
         return make_cloud(frame, options)
     except (SourceError, OSError) as error:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-from hodge_pipeline.registration.clouds import OTHER_UNITS, CloudOptions, in_blocks, landmarks_of, prepare_clouds
+from hodge_pipeline.registration.cloud_set import in_blocks, prepare_clouds
+from hodge_pipeline.registration.clouds import CloudOptions, landmarks_of
 from hodge_pipeline.stages import Step, Steps, Workers, in_order
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.codec import CLOUDS
 from hodge_pipeline.types import CloudSet, Source
-from hodge_pipeline.types.notes import Note
 
 
 def make_clouds(source: Source, options: CloudOptions, steps: Steps, workers: Workers) -> CloudSet:
@@ -20,10 +20,9 @@ def make_clouds(source: Source, options: CloudOptions, steps: Steps, workers: Wo
 
 
 def clouds(source: Source, options: CloudOptions, *, workers: Workers, step: Step) -> CloudSet:
-    """Step: the cloud of each frame by `registration.clouds`."""
+    """Step: the cloud of each frame by `registration.cloud_set`."""
     made, notes = prepare_clouds(source.frames, options, workers, step.folder / CLOUDS, step.advance)
-    for note in notes:
-        step.note(Note("other units" if OTHER_UNITS in note else "clouds", detail=note))
+    step.note(*notes)
     return made
 
 

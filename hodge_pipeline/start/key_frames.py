@@ -14,7 +14,8 @@ from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.complex.components import connected_components, in_runs
 from hodge_pipeline.registration.bridging import bridge
-from hodge_pipeline.registration.clouds import CloudOptions, no_clouds
+from hodge_pipeline.registration.cloud_set import no_clouds
+from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.focal import estimate_focal
 from hodge_pipeline.registration.gaps import told_gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chained

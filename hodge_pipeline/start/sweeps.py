@@ -14,16 +14,8 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.registration.clouds import (
-    FACTOR_OF_UNITS,
-    CloudOptions,
-    Oddity,
-    in_range,
-    make_cloud,
-    out_of_range,
-    reach_m,
-    shortened,
-)
+from hodge_pipeline.registration.cloud_set import FACTOR_OF_UNITS, shortened
+from hodge_pipeline.registration.clouds import CloudOptions, Oddity, in_range, make_cloud, out_of_range, reach_m
 from hodge_pipeline.registration.gaps import told_gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, OdometryOptions, chained
 from hodge_pipeline.registration.pairs import register_pairs
