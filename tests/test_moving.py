@@ -18,7 +18,7 @@ from hodge_pipeline.registration import tracking
 from hodge_pipeline.registration.flow import find_corners, flow_image, follow
 from hodge_pipeline.registration.moving import MUCH, Moments, contradicting, misplaced, rival_motion
 from hodge_pipeline.registration.sightings import Sightings
-from hodge_pipeline.registration.tracking import _View
+from hodge_pipeline.registration.tracked_frame import TrackedFrame
 from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.start.key_frames import KeyFrameStart, Tracked, track
 from hodge_pipeline.store import artifacts
@@ -188,7 +188,9 @@ def test_what_was_left_out_of_a_key_frame_is_not_misplaced(still: Source) -> Non
     recipe = load_recipe("demo", [], source.path)
     assert isinstance(recipe.start, KeyFrameStart)
     options = recipe.start._tracking(recipe.clouds)
-    key, view = (_View(options, source.frames[place], place) for place in (0, 4))
+    key, view = (
+        TrackedFrame(source.frames[place], place, options.clouds, options.odometry.registration) for place in (0, 4)
+    )
     side, board = int(np.sqrt(0.2 * WIDTH * HEIGHT)), np.zeros((HEIGHT, WIDTH), np.uint8)
     board[20 : 20 + side, 20 : 20 + side] = 1
     assert key.image is not None and view.image is not None

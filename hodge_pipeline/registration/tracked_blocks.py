@@ -13,19 +13,6 @@ from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, PointCloud, Words
 
 STEP, CLOUD, SIGHTING = "step_", "cloud_", "sighting_"
-COLUMNS = (
-    "keys",
-    "rows",
-    "anchors",
-    "key_from_row",
-    "fitness",
-    "moving",
-    "doubtful",
-    "blank",
-    "apart",
-    "unread",
-    "unread_why",
-)
 
 
 @dataclass(frozen=True)
@@ -56,6 +43,10 @@ class BlockRows:
     unread: Ints
     unread_why: Words
     notes: tuple[str, ...]
+
+
+COLUMNS = tuple(field.name for field in fields(BlockRows) if field.name not in ("steps", "notes"))
+"""The arrays of `BlockRows`, each a file's own; steps are stored column by column, notes as words."""
 
 
 @dataclass(frozen=True)

@@ -9,28 +9,24 @@ many workers there are, and memory holds one block a worker, never the sequence.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
-from typing import Any
 
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.errors import SourceError
-from hodge_pipeline.registration.clouds import CloudOptions, cloud_or_note, is_blank
-from hodge_pipeline.registration.flow import Corners, FlowImage, Followed, find_corners, flow_image, follow
+from hodge_pipeline.registration.clouds import CloudOptions
+from hodge_pipeline.registration.flow import Followed, follow
 from hodge_pipeline.registration.moving import AT_REST, Moments, contradicting, misplaced, rival_motion
 from hodge_pipeline.registration.odometry import SURE_FITNESS, OdometryOptions
 from hodge_pipeline.registration.sightings import Sightings
 from hodge_pipeline.registration.tracked_blocks import TrackedBlock
+from hodge_pipeline.registration.tracked_frame import FEWEST_FOLLOWED, TrackedFrame
 from hodge_pipeline.registry import plugin_errors
-from hodge_pipeline.types import Bytes, Edges, Floats, Frame, Ints, PointCloud, Registration
+from hodge_pipeline.types import Edges, Floats, Frame, Ints, PointCloud, Registration
 
 FRAMES_IN_BLOCK = 96
 """Three seconds at frame rate; the first and the last frame of a block are key frames, however little they moved."""
 LONGEST_GUESS = 4.0
 """Frame steps over which a motion is taken to go on as it was."""
-FEWEST_FOLLOWED = 25
-"""Corners that must agree on a motion for it to be believed; below it clouds are registered."""
 FEW_FOLLOWED, SMALL_SHARE = 60, 0.35
 """Inliers, and share of the key frame's corners, below which a frame becomes a key frame."""
 DOUBTFUL = 0.25
@@ -87,74 +83,6 @@ def track_block(options: TrackingOptions, block: FrameBlock) -> TrackedBlock:
     return _Tracker(options, block).run()
 
 
-def read_once(frame: Frame) -> Frame:
-    """The frame, whose images are decoded once and kept as long as it is; an error is raised each time."""
-    depth, colour = frame.read_depth, frame.read_colour
-    return replace(frame, read_depth=depth and cache(depth), read_colour=colour and cache(colour))
-
-
-class _View:
-    """A frame at its place in the block: its image, corners and cloud, each made when it is first needed."""
-
-    def __init__(self, options: TrackingOptions, frame: Frame, place: int) -> None:
-        self._options, self._frame, self.place = options, read_once(frame), place
-        self.left_out, self.unread = 0.0, ""
-        self.twist: Floats = np.zeros(6)
-        self.colour_delay_s = frame.colour_delay_s
-
-    @cached_property
-    def image(self) -> FlowImage | None:
-        """The image for optical flow, None where it lacks colour, depth or camera, or cannot be read (see `unread`)."""
-        clouds = self._options.clouds
-        try:
-            return flow_image(self._frame, (clouds.min_range_m, clouds.max_range_m), clouds.unit_m)
-        except (SourceError, OSError) as error:
-            self.unread = str(error)
-            return None
-
-    @property
-    def is_blank(self) -> bool:
-        """Whether the frame has depth, and an image that shows nothing."""
-        return self.image is not None and bool((self.image.depth > 0).any()) and is_blank(self.image.grey)
-
-    @cached_property
-    def corners(self) -> Corners | None:
-        """What flow follows from this frame."""
-        return None if self.image is None else find_corners(self.image)
-
-    @property
-    def can_be_followed(self) -> bool:
-        """Whether it shows enough for flow."""
-        return self.corners is not None and len(self.corners) >= FEWEST_FOLLOWED
-
-    @cached_property
-    def cloud_and_note(self) -> tuple[PointCloud, str]:
-        """The frame's cloud, and a note where something is odd about it."""
-        return cloud_or_note(self._frame, self._options.clouds)
-
-    @property
-    def cloud(self) -> PointCloud:
-        """The frame's cloud."""
-        return self.cloud_and_note[0]
-
-    @cached_property
-    def prepared(self) -> Any:
-        """What the registrar made of the cloud."""
-        return self._options.odometry.registration.prepare(self.cloud)
-
-    def leave_out(self, moving: Bytes, corners: Corners) -> None:
-        """From now on the frame has no depth where `moving (H, W)` is not 0, the share `left_out` at most, and flow
-        follows these corners.
-        """
-        assert self.image is not None
-        self.left_out = max(self.left_out, float((moving > 0).mean()))
-        depth = np.where(moving, np.float32(0), self.image.depth)
-        self._frame = replace(self._frame, read_depth=lambda: depth)
-        for made in ("image", "cloud_and_note", "prepared"):
-            self.__dict__.pop(made, None)
-        self.corners = corners
-
-
 class _Tracker:
     """Follows one block: the last key frame, the last frame tracked, and the frame after it where that was lost.
 
@@ -165,7 +93,7 @@ class _Tracker:
         self._options, self._block = options, block
         self._registrar, self._limits = options.odometry.registration, options.odometry
         self._rows: dict[int, tuple[int, Floats, float]] = {}
-        self._keys: list[_View] = []
+        self._keys: list[TrackedFrame] = []
         self._clouds: dict[int, tuple[PointCloud, str]] = {}
         self._steps: list[tuple[int, int, Registration]] = []
         self._corner_points: dict[int, Floats] = {}
@@ -209,7 +137,7 @@ class _Tracker:
             sightings=self._kept_sightings(first),
         )
 
-    def _look_at(self, view: _View) -> None:
+    def _look_at(self, view: TrackedFrame) -> None:
         if view.is_blank:
             self._blank.add(view.place)
         if view.unread:
@@ -224,36 +152,36 @@ class _Tracker:
         """The rows at these places, the one of the warm-up left out."""
         return self._block.rows[[place for place in sorted(places) if place >= self._block.warm_up]]
 
-    def _view(self, place: int) -> _View:
-        return _View(self._options, self._block.frames[place], place)
+    def _view(self, place: int) -> TrackedFrame:
+        return TrackedFrame(self._block.frames[place], place, self._options.clouds, self._registrar)
 
-    def _warm_up(self, start: _View) -> None:
+    def _warm_up(self, start: TrackedFrame) -> None:
         before = self._view(0)
         found = self._flowed(start, before, np.eye(4))
         step = found or self._registrar.register(start.prepared, before.prepared, np.eye(4))
         if self._is_good(step):
             start.twist = self._velocity = -se3.log(step.i_from_j) / self._duration(0, start.place)
 
-    def _begin(self, view: _View) -> None:
+    def _begin(self, view: TrackedFrame) -> None:
         """From here on this view is the key frame, and the last frame tracked."""
         if self._keys:
             self._keep_cloud(self._keys.pop())
         self._keys.append(view)
         self._rows[view.place] = (view.place, np.eye(4), 1.0)
         self._last, self._key_from_last = view, np.eye(4)
-        self._missed: _View | None = None
+        self._missed: TrackedFrame | None = None
         self._is_cut = False
 
-    def _keep_cloud(self, key: _View) -> None:
+    def _keep_cloud(self, key: TrackedFrame) -> None:
         """All that is kept of a key frame that nothing follows any more; of the first, the block before keeps it."""
         if key.place > self._block.warm_up or not self._block.warm_up:
             self._clouds[key.place] = key.cloud_and_note
 
-    def _promote(self, view: _View, step: Registration) -> None:
+    def _promote(self, view: TrackedFrame, step: Registration) -> None:
         self._steps.append((self._keys[-1].place, view.place, step))
         self._begin(view)
 
-    def _follow(self, view: _View, is_last: bool) -> None:
+    def _follow(self, view: TrackedFrame, is_last: bool) -> None:
         key = self._keys[-1]
         found = self._flowed(key, view, self._key_from_last @ self._ahead(view))
         if found is None and self._last is not key and self._last.corners is not None:
@@ -271,7 +199,7 @@ class _Tracker:
         if is_last or (has_left and len(view.cloud)):  # a key frame without depth is joined to nothing
             self._promote(view, found)
 
-    def _flowed(self, key: _View, view: _View, guess: Floats) -> Registration | None:
+    def _flowed(self, key: TrackedFrame, view: TrackedFrame, guess: Floats) -> Registration | None:
         """The motion by optical flow, its inliers kept as sightings; None where it fails; that of the clouds where this
         fits the depth much better, as in a bare room whose corners lie on a moving object.
         """
@@ -295,7 +223,9 @@ class _Tracker:
         information = found.information / CORNERS_A_SAMPLE
         return Registration(found.key_from_view, information, found.share, found.rmse_m, len(found.rows), 1, True)
 
-    def _of_most_area(self, key: _View, view: _View, found: Followed, guess: Floats) -> tuple[Followed, float]:
+    def _of_most_area(
+        self, key: TrackedFrame, view: TrackedFrame, found: Followed, guess: Floats
+    ) -> tuple[Followed, float]:
         """The motion found, or another that more of the image follows, and the share that contradicts it; the depth of
         what moves is removed from the key frame.
         """
@@ -310,7 +240,7 @@ class _Tracker:
                 found, against = rival.followed, rival.contradicting
         return found, against
 
-    def _moments(self, key: _View, view: _View, key_from_view: Floats) -> Moments:
+    def _moments(self, key: TrackedFrame, view: TrackedFrame, key_from_view: Floats) -> Moments:
         """Velocities and delays of both frames, the view's by its motion since the last frame tracked; at rest before
         the first key frame.
         """
@@ -321,11 +251,11 @@ class _Tracker:
         twist = view.twist if view is self._last else step / self._duration(self._last.place, view.place)
         return Moments(key.twist, twist, key.colour_delay_s, view.colour_delay_s)
 
-    def _doubt(self, view: _View, share: float) -> None:
+    def _doubt(self, view: TrackedFrame, share: float) -> None:
         if share > DOUBTFUL:
             self._doubtful.add(view.place)
 
-    def _flowed_from_last(self, view: _View) -> Registration | None:
+    def _flowed_from_last(self, view: TrackedFrame) -> Registration | None:
         """The motion from the last frame tracked, which becomes a key frame, where flow finds this one."""
         found = self._flowed(self._last, view, self._ahead(view))
         if found is not None:
@@ -339,7 +269,7 @@ class _Tracker:
         step = self._flowed(key, last, key_from_last)
         return step or self._registrar.register(key.prepared, last.prepared, key_from_last)
 
-    def _registered_by_clouds(self, view: _View) -> Registration:
+    def _registered_by_clouds(self, view: TrackedFrame) -> Registration:
         """The motion by the registrar of odometry."""
         found = self._confirmed(self._keys[-1], view, self._registered(self._keys[-1], view, self._key_from_last))
         if found.fitness < self._options.kept_fitness and self._last.place != self._keys[-1].place:
@@ -348,7 +278,7 @@ class _Tracker:
             found = self._from_missed(view, self._missed, found)
         return found
 
-    def _from_last(self, view: _View, to_key: Registration) -> Registration:
+    def _from_last(self, view: TrackedFrame, to_key: Registration) -> Registration:
         """The view seen from the last frame tracked, which becomes a key frame, where these two share more."""
         found = self._confirmed(self._last, view, self._registered(self._last, view, np.eye(4)))
         if found.fitness <= to_key.fitness or not self._is_good(found):
@@ -356,7 +286,7 @@ class _Tracker:
         self._promote(self._last, self._step_to_last())
         return found
 
-    def _from_missed(self, view: _View, missed: _View, to_key: Registration) -> Registration:
+    def _from_missed(self, view: TrackedFrame, missed: TrackedFrame, to_key: Registration) -> Registration:
         """The motion from the frame lost before, which becomes a key frame by a guess, where these two register."""
         found = self._registrar.register(missed.prepared, view.prepared, np.eye(4))
         found = self._confirmed(missed, view, found)
@@ -365,7 +295,7 @@ class _Tracker:
         self._promote_by_guess(missed)
         return found
 
-    def _confirmed(self, target: _View, view: _View, by_clouds: Registration) -> Registration:
+    def _confirmed(self, target: TrackedFrame, view: TrackedFrame, by_clouds: Registration) -> Registration:
         """The motion by flow from where clouds put the view. Without one that of the clouds, of fitness 0 where flow
         could tell and they are not sure: from one frame to the next that is a cut in the recording.
         """
@@ -375,7 +305,7 @@ class _Tracker:
             return replace(by_clouds, fitness=0.0)
         return by_flow or by_clouds
 
-    def _lose(self, view: _View, is_last: bool) -> None:
+    def _lose(self, view: TrackedFrame, is_last: bool) -> None:
         """Its motion is a guess; the next frame tries the same key frame again."""
         if is_last:
             self._promote_by_guess(view)
@@ -384,18 +314,18 @@ class _Tracker:
             self._missed = view
         self._rows[view.place] = (self._keys[-1].place, self._guessed(view).i_from_j, np.nan)
 
-    def _promote_by_guess(self, view: _View) -> None:
+    def _promote_by_guess(self, view: TrackedFrame) -> None:
         """The view becomes a key frame by a guess; over a cut by no step, since clouds alone would bridge it."""
         if self._is_cut:
             self._begin(view)
         else:
             self._promote(view, self._guessed(view))
 
-    def _guessed(self, view: _View) -> Registration:
+    def _guessed(self, view: TrackedFrame) -> Registration:
         motion = self._key_from_last @ self._ahead(view)
         return Registration(motion, np.zeros((6, 6)), 0.0, np.nan, 0, 0, False)
 
-    def _registered(self, target: _View, source: _View, standing: Floats) -> Registration:
+    def _registered(self, target: TrackedFrame, source: TrackedFrame, standing: Floats) -> Registration:
         """From a motion that goes on as before and, where that may not have worked, from `standing`, that of none."""
         step = self._registrar.register(target.prepared, source.prepared, standing @ self._ahead(source))
         if step.fitness < self._options.kept_fitness:
@@ -406,7 +336,7 @@ class _Tracker:
     def _is_good(self, step: Registration) -> bool:
         return step.fitness >= self._limits.min_fitness
 
-    def _ahead(self, view: _View) -> Floats:
+    def _ahead(self, view: TrackedFrame) -> Floats:
         seconds = min(self._duration(self._last.place, view.place), LONGEST_GUESS * self._usual_step)
         return se3.exp(self._velocity * seconds)
 
@@ -419,7 +349,7 @@ class _Tracker:
         turned = float(se3.rotation_angle(key_from_view))
         return moved >= self._options.distance_m or turned >= self._options.angle_rad
 
-    def _sees_little(self, view: _View) -> bool:
+    def _sees_little(self, view: TrackedFrame) -> bool:
         """Whether flow lost most corners of the key frame; what the registrar found is judged by its fitness."""
         key = self._keys[-1]
         found = self._sightings.get((key.place, view.place))
