@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import small_gicp
@@ -17,13 +17,14 @@ from hodge_pipeline.registration.assessment import MIN_POINTS, assess, to_regist
 from hodge_pipeline.types import Floats, Ints, PointCloud, Registration
 
 ROTATION_EPSILON_RAD = 1e-3
+"""Least step of rotation: 5 mm at 5 m, below the spacing of points."""
 EPSILON_SHARE = 0.02
 """Least step of translation, of the finest distance: 1 mm of the usual 5 cm."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class _SmallGicp:
-    """Options and levels that both forms share."""
+    """Options of both forms, and the registration level by level."""
 
     distances_m: tuple[float, ...] = Field(
         default=(0.3, 0.1, 0.05),
@@ -70,22 +71,37 @@ class _SmallGicp:
         return self
 
     def _registered(
-        self, align: Callable[..., Any], target: PreparedCloud, source: PreparedCloud, guess: Floats
+        self, align: Callable[..., Any], target: PreparedCloud, source: PreparedCloud, i_from_j: Floats
     ) -> Registration:
         """The registration, level by level; `align` calls small_gicp on a sample of the source."""
-
-        def at(level: _Level, guess: Floats) -> Any:
-            return align(
-                source.sample(level.source_points),
-                guess,
-                max_correspondence_distance=level.distance_m,
+        guess = np.asarray(i_from_j, np.float64)
+        if min(len(target), len(source)) < MIN_POINTS:
+            return unregistered(guess)
+        motion, iterations, converged = guess, 0, False
+        for distance_m, count in zip(self.distances_m, self.source_points, strict=True):
+            result = align(
+                source.sample(count),
+                motion,
+                max_correspondence_distance=distance_m,
                 max_iterations=self.max_iterations,
                 rotation_epsilon=ROTATION_EPSILON_RAD,
                 translation_epsilon=EPSILON_SHARE * self.distances_m[-1],
             )
-
-        levels = [_Level(*level) for level in zip(self.distances_m, self.source_points, strict=True)]
-        return _register(at, levels, target, source, guess, self.points_per_sample)
+            if not se3.is_motion(result.T_target_source):  # a singular system: nothing within the distance
+                return unregistered(guess)
+            motion, converged = np.asarray(result.T_target_source), bool(result.converged)
+            iterations += 1 + int(result.iterations)  # small_gicp counts from 0
+        points = source.sample_points(self.source_points[-1])
+        assessment = assess(
+            source_points=points,
+            target_points=target.points,
+            target_normals=target.normals,
+            find_nearest=target.find_nearest,
+            i_from_j=motion,
+            max_distance_m=self.distances_m[-1],
+            points_per_sample=self.points_per_sample * len(points) / len(source),
+        )
+        return to_registration(assessment, motion, iterations, converged)
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -186,7 +202,7 @@ class PreparedCloud:
         if self._given_normals is not None:
             return self._given_normals
         cloud = small_gicp.PointCloud(self.points)
-        small_gicp.estimate_normals(cloud, self.tree, self._neighbours(len(self)))
+        small_gicp.estimate_normals(cloud, self.tree, min(self.neighbours, len(self)))
         return np.asarray(cloud.normals())[:, :3]
 
     def sample(self, count: int) -> Any:
@@ -211,46 +227,7 @@ class PreparedCloud:
     def _stride(self, count: int) -> int:
         return max(1, -(-len(self) // count))
 
-    def _neighbours(self, count: int) -> int:
-        return min(self.neighbours, count)
-
     def _with_covariances(self, points: Floats, tree: Any) -> Any:
         cloud = small_gicp.PointCloud(points)
-        small_gicp.estimate_covariances(cloud, tree, self._neighbours(len(points)))
+        small_gicp.estimate_covariances(cloud, tree, min(self.neighbours, len(points)))
         return cloud
-
-
-class _Level(NamedTuple):
-    distance_m: float
-    source_points: int
-
-
-def _register(
-    align: Callable[[_Level, Floats], Any],
-    levels: list[_Level],
-    target: PreparedCloud,
-    source: PreparedCloud,
-    i_from_j: Floats,
-    points_per_sample: float,
-) -> Registration:
-    guess = np.asarray(i_from_j, np.float64)
-    if min(len(target), len(source)) < MIN_POINTS:
-        return unregistered(guess)
-    motion, iterations, converged = guess, 0, False
-    for level in levels:
-        result = align(level, motion)
-        if not se3.is_motion(result.T_target_source):  # a singular system: nothing within the distance
-            return unregistered(guess)
-        motion, converged = np.asarray(result.T_target_source), bool(result.converged)
-        iterations += 1 + int(result.iterations)  # small_gicp counts from 0
-    points = source.sample_points(levels[-1].source_points)
-    assessment = assess(
-        source_points=points,
-        target_points=target.points,
-        target_normals=target.normals,
-        find_nearest=target.find_nearest,
-        i_from_j=motion,
-        max_distance_m=levels[-1].distance_m,
-        points_per_sample=points_per_sample * len(points) / len(source),
-    )
-    return to_registration(assessment, motion, iterations, converged)

@@ -33,7 +33,7 @@ class PointToPlaneIcp:
 
     def prepare(self, cloud: PointCloud) -> Open3dCloud:
         """The cloud with normals, colours and a tree, each made when it is first needed."""
-        return Open3dCloud(cloud, neighbours=10)
+        return Open3dCloud(cloud)
 
     def register(self, target: Open3dCloud, source: Open3dCloud, i_from_j: Floats) -> Registration:
         """Cloud j (source) moved onto cloud i (target) from the guess."""

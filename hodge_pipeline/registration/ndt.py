@@ -31,7 +31,7 @@ class Ndt:
 
     def prepare(self, cloud: PointCloud) -> Open3dCloud:
         """The cloud, and a tree when the result is assessed."""
-        return Open3dCloud(cloud, neighbours=10)
+        return Open3dCloud(cloud)
 
     def register(self, target: Open3dCloud, source: Open3dCloud, i_from_j: Floats) -> Registration:
         """Cloud j (source) moved onto cloud i (target) from the guess."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.assessment import MIN_POINTS, assess, to_registration, unregistered
+from hodge_pipeline.registration.clouds import NORMAL_NEIGHBOURS
 from hodge_pipeline.registration.gicp import PreparedCloud
 from hodge_pipeline.registration.one_thread import o3d
 from hodge_pipeline.types import Floats, PointCloud, Registration
@@ -21,8 +22,8 @@ Align = Callable[["Open3dCloud", "Open3dCloud", float, Floats], Any]
 class Open3dCloud(PreparedCloud):
     """Adds open3d's own cloud to the trees that the assessment needs."""
 
-    def __init__(self, cloud: PointCloud, neighbours: int) -> None:
-        super().__init__(cloud, neighbours)
+    def __init__(self, cloud: PointCloud) -> None:
+        super().__init__(cloud, NORMAL_NEIGHBOURS)
         finite = np.isfinite(cloud.points_in_cam).all(axis=1)
         self._colours = None if cloud.colours is None else np.asarray(cloud.colours[finite], float) / 255.0
 
