@@ -142,7 +142,7 @@ def refine_trajectory(
     dask: str | None,
 ) -> None:
     """Run `slam_refine` on given poses and frames; `CheckError`, exit code 3, where the poses given are better."""
-    from hodge_pipeline.start.match_poses import recipe_for
+    from hodge_pipeline.uses.refinement_recipe import recipe_for
 
     if not poses.exists():
         raise SourceError(f"{poses}: no such file or folder: give the poses to refine")

@@ -11,9 +11,8 @@ from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
 from hodge_pipeline.pairs.revisits import Revisits, find_revisits
-from hodge_pipeline.registration import odometry as tracking
 from hodge_pipeline.registration.clouds import CloudOptions
-from hodge_pipeline.registration.odometry import Odometry, OdometryOptions
+from hodge_pipeline.registration.odometry import Odometry, OdometryOptions, odometry
 from hodge_pipeline.registration.odometry_path import drift_of
 from hodge_pipeline.scene import START, Closed, KeyFrames, Round, Scene, key_source, sequences_of, vertex_ids
 from hodge_pipeline.solvers.poisson import PoissonSolver
@@ -52,7 +51,8 @@ class OdometryStart(OdometryOptions):
 
     def begin(self, source: Source, clouds: CloudOptions, steps: Steps, workers: Workers) -> Scene:
         """Every frame of the source with its cloud and its pose by odometry."""
-        sequences, stamps = tuple(sequences_of(source).values()), _stamps(source)
+        sequences = tuple(sequences_of(source).values())
+        stamps = np.array([frame.stamp_s for frame in source.frames])
         made = make_clouds(source, clouds, steps, workers)
         found = steps.step(
             chain, made, sequences, stamps, self.odometry, title="odometry", total=len(stamps), workers=workers
@@ -124,10 +124,6 @@ def chain(
 ) -> Odometry:
     """Step: poses of all frames by `registration.odometry`."""
     assert clouds.folder is not None
-    found = tracking.odometry(clouds.folder, sequences, stamps_s, options, workers, step.advance)
+    found = odometry(clouds.folder, sequences, stamps_s, options, workers, step.advance)
     step.note(*notes_of("start", found.notes))
     return found
-
-
-def _stamps(source: Source) -> Floats:
-    return np.array([frame.stamp_s for frame in source.frames])

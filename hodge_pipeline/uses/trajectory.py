@@ -17,10 +17,10 @@ from hodge_pipeline.refine.guard import Decision
 from hodge_pipeline.refine.open3d_objects import poses_of, with_poses
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.sources.inspect import guess_reader
-from hodge_pipeline.start.match_poses import recipe_for, recipe_of
 from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame, Source
 from hodge_pipeline.uses.recipe_run import run as recipe_run
+from hodge_pipeline.uses.refinement_recipe import recipe_for, recipe_of
 
 Array = TypeVar("Array")
 
