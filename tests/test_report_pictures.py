@@ -1,4 +1,4 @@
-"""The photographs of a report: what is near hides what is far, a room is open towards the eye, nothing breaks them."""
+"""The pictures of scenes in a report: what is near hides what is far, rooms open towards the eye; nothing breaks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hodge_pipeline.recording.shapes import up_and_ahead
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.contents import EdgeRow, Pictures, Report, SourceSummary, paths_of
 from hodge_pipeline.report.painting import turns_deg
-from hodge_pipeline.report.photographs import changed_most, four_sides, worst_pairs
+from hodge_pipeline.report.scene_pictures import changed_most, four_sides, worst_pairs
 from hodge_pipeline.types import CloudSet, Floats, Frame, PointCloud, Source
 
 pytestmark = pytest.mark.draws

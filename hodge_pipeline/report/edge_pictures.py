@@ -18,7 +18,7 @@ from hodge_pipeline.report import raster
 from hodge_pipeline.report.diagnosis_page import EdgePictures
 from hodge_pipeline.report.document import Picture
 from hodge_pipeline.report.painting import painted
-from hodge_pipeline.report.photographs import images_of
+from hodge_pipeline.report.scene_pictures import images_of
 from hodge_pipeline.types import Bytes, CloudSet, Floats, Floats32, Frame, Ints, PointCloud, ViewGraph
 from hodge_pipeline.types.text import UNKNOWN_UNIT
 

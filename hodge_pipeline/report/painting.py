@@ -12,6 +12,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.evaluation.difference import floor_of
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.document import Picture
+from hodge_pipeline.report.verdict import TRUTH
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 from hodge_pipeline.types.text import UNKNOWN_UNIT
 
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 DOTS_PER_INCH = 150
 SIZE = 5.0, 3.9
 """Inches."""
-TRUTH = "truth"
 LINES = (":", "#D55E00"), ("-", "#0072B2")
 """Before and after, as in every plot."""
 

@@ -27,8 +27,8 @@ from hodge_pipeline.report.contents import (
     TrajectoryRow,
     paths_of,
 )
-from hodge_pipeline.report.photographs import changed_most, four_sides, worst_pairs
 from hodge_pipeline.report.refined import summary
+from hodge_pipeline.report.scene_pictures import changed_most, four_sides, worst_pairs
 from hodge_pipeline.report.summary import graph_summary, trajectory_rows, unheld, weigh_wrong, worst_edges
 from hodge_pipeline.report.truth import truth_doubts
 from hodge_pipeline.rounds.settling import last_shift_m

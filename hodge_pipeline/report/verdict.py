@@ -35,7 +35,7 @@ REFINEMENTS: dict[str, Outcome] = {
     "refined": "improved", "solved": "improved", "optimal": "unchanged", "worse": "worse", "forced": "worse",
     "convention": "not measured", "nothing": "not measured",
 }  # fmt: skip
-DOUBTS = {
+LEADS = {
     "images missing": "{count} of {detail} are missing",
     "other scale": "in another scale than the truth",
     "truth convention": "the truth seems to be in another convention",
@@ -60,7 +60,7 @@ REASONS = {
     "left apart": "a guess joins what tracking left apart",
     "wrong": "edges that it uses are judged wrong",
 }
-"""By kind of note, what a headline begins with (`DOUBTS`; lost frames from `MOSTLY_LOST` on), and the reasons of `in
+"""By kind of note, what a headline begins with (`LEADS`; lost frames from `MOSTLY_LOST` on), and the reasons of `in
 doubt, since …` (`REASONS`), whatever the measures say."""
 MOSTLY_LOST = 0.5
 """The share of the frames."""
@@ -119,9 +119,9 @@ def judge(report: Report) -> Verdict:
     reasons = " and ".join(REASONS[note.kind] for note in told if note.kind in REASONS.keys() - apart)
     frames = report.source.frames
     doubts = [
-        DOUBTS[note.kind].format(count=note.count, detail=note.detail, frames=frames)
+        LEADS[note.kind].format(count=note.count, detail=note.detail, frames=frames)
         for note in told
-        if note.kind in DOUBTS and (note.kind != "tracking lost" or note.count > MOSTLY_LOST * frames)
+        if note.kind in LEADS and (note.kind != "tracking lost" or note.count > MOSTLY_LOST * frames)
     ]
     doubts += [f"in doubt, since {reasons}"] if reasons else []
     doubts += [report.refinement.doubt] if report.refinement and report.refinement.doubt else []

@@ -17,8 +17,8 @@ from hodge_pipeline.recording.comparison import record_comparison
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.contents import GraphSummary, Pictures, Report, SourceSummary, paths_of
 from hodge_pipeline.report.document import Banner, Document, Picture, Section, Table, markdown, render
-from hodge_pipeline.report.photographs import sides
 from hodge_pipeline.report.plots import draw
+from hodge_pipeline.report.scene_pictures import sides
 from hodge_pipeline.report.verdict import GRAPH_NAMES, judge
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import is_clock

@@ -64,10 +64,9 @@ def changed_most(
 
 def _moved_m(clouds: CloudSet, before: Floats, after: Floats, pairs: Ints) -> Floats:
     """How far (P,) the middle of cloud j moved against frame i."""
-    middles = np.array([np.mean(clouds[int(j)].points_in_cam, axis=0, dtype=float) for j in range(len(clouds))
-                        if len(clouds[int(j)])])  # fmt: skip
     middle = np.zeros((len(clouds), 3))
-    middle[clouds.sizes > 0] = middles
+    for row in np.flatnonzero(clouds.sizes > 0).tolist():
+        middle[row] = np.mean(clouds[row].points_in_cam, axis=0, dtype=float)
     i, j = pairs.T
     seen = [
         se3.transform(se3.inverse(poses[i]) @ poses[j], middle[j][:, None])[:, 0] for poses in (before, after)
