@@ -50,7 +50,7 @@ class NerfstudioReader:
     every: int = Field(1, ge=1, description="take every n-th frame")
 
     def sniff(self, path: Path) -> Sniff:
-        """By the name, or by the keys near the first_text."""
+        """By the name, or by the keys near its beginning."""
         path = Path(path)
         text = first_text(transforms_file(path))
         if '"transform_matrix"' in text or '"frames"' in text:

@@ -34,7 +34,7 @@ class Open3dReader:
     """Opens a pose graph or a camera trajectory that Open3D wrote."""
 
     def sniff(self, path: Path) -> Sniff:
-        """By the class that the file names near its first_text, or the keys that such a class begins with."""
+        """By the class that the file names near its beginning, or the keys that such a class begins with."""
         text = first_text(Path(path))
         for name in (GRAPH, TRAJECTORY):
             if f'"{name}' in text:

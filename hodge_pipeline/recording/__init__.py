@@ -1,1 +1,1 @@
-"""The Rerun recording of a run. Every line of Rerun is in this package; `options` alone imports without it."""
+"""The Rerun recording of a run. Every line of Rerun is in this package."""

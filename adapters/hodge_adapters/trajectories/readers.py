@@ -1,4 +1,4 @@
-"""Readers of trajectories alone, TUM and KITTI text; the formats themselves are in `poses_text`."""
+"""Readers of trajectories alone, TUM and KITTI text; the formats themselves are in `trajectories.text`."""
 
 from __future__ import annotations
 
