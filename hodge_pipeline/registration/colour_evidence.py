@@ -11,9 +11,11 @@ from hodge_pipeline import se3
 from hodge_pipeline.types import Bytes, CloudSet, Floats, Ints, PointCloud
 
 POINTS_COMPARED = 800
+"""Of a cloud, at most: the standard error of the share that conflicts is below 2 %."""
 SURFACES_KEPT = 64
 """Trees in memory, 0.1 to 1 MB each; pairs come sorted by their first cloud."""
 FEWEST_COMPARED = 100
+"""Common points, at least: that standard error is 5 % at most."""
 NEAR_SPACINGS = 1.5
 """Distance of points of one surface, at most, in distances between neighbours of a cloud."""
 DARK = 20.0

@@ -20,6 +20,7 @@ SEEDS = 160
 PARTNERS = 20
 """Compatible matches in such a group."""
 FEWEST_MATCHES = 4
+"""Three fix a motion, the fourth tests it."""
 REFINEMENTS = 8
 """Least-squares fits to the inliers, at most."""
 

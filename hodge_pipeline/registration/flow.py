@@ -25,6 +25,7 @@ CORNER_QUALITY, CORNERS_APART = 0.01, 1 / 80
 WINDOW_PX, LEVELS = 15, 3
 """Of the flow: with a predicted motion it finds a corner within about 60 pixels of where it should be."""
 BLUR_PX = 5
+"""Side of the square over which grey values are averaged before they are compared."""
 BACKWARD_PX = 0.7
 """A corner that is followed back must end this near to where it began."""
 

@@ -12,15 +12,19 @@ from hodge_pipeline.types import Floats, Floats32, Ints, PointCloud
 NORMAL_NEIGHBOURS = 30
 FEATURE_NEIGHBOURS = 100
 FEATURE_RADIUS_VOXELS = 5.0
+"""Neighbours of a normal and of a feature, and radius of a feature: as in open3d's tutorial on global registration."""
 FEWEST_POINTS = 20
 BLOCK_ENTRIES = 4_000_000
+"""Squared distances of features in memory at once, 16 MB."""
 DIRECTION_STEP = 0.06
 """Side of a cell of directions, radians."""
 DEEPER, LEVEL = 1.3, 1e-3
 """What lies further behind the nearest point of its cell is hidden; a slanted surface is not, nor a floor, which goes
 farther within a cell the more level the view, in radians."""
-SEEN_FROM_ORIGIN = 0.75
-FAR_RADII = 3.0
+SEEN_FROM_ORIGIN, FAR_RADII = 0.75, 3.0
+"""Share of the points that must be visible from the origin for it to be the viewpoint, and its distance from the middle
+in RMS radii of the cloud, at most.
+"""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from hodge_pipeline.registration.global_features import DescribedCloud, describe
 from hodge_pipeline.types import Match, PointCloud
 
 TOLERANCE_VOXELS = 1.5
+"""Distance of matched points at the right motion: each is the mean of its own voxel, whose diagonal is 1.7."""
 MOST_POINTS = 12_000
 """Of a cloud at one of several scales: beyond it two take a second to match, and a coarser scale serves."""
 

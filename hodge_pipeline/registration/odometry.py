@@ -19,8 +19,8 @@ from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Registration
 
-STEPS_IN_BLOCK = 32
-WARM_UP_STEPS = 2
+STEPS_IN_BLOCK, WARM_UP_STEPS = 32, 2
+"""Steps that a worker registers at once, and those before them that give it its first velocity."""
 SURE_FITNESS = 0.7
 """Below it a second registration starts from no motion, and the fitter one is kept. Over a hole in the recording (a
 step ten times as long as usual), and where optical flow could tell a motion and finds none, it must be reached, or

@@ -15,7 +15,9 @@ from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, Floats
 
 TRIPLES = 300
+"""Of matches, drawn at random: where 30 % are right, no triple is in 0.03 % of pairs."""
 FEWEST_MATCHES = 8
+"""As many agree by chance in unrelated frames: see `Rgbd.min_inliers`."""
 PIXEL_SIGMA = 0.75
 """Pixels: a feature's own error, once the shutter's is taken out, on TUM fr1."""
 DEPTH_SIGMAS = 2.0

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hodge_pipeline.types import Bytes, Floats, Floats32, Ints
 
 POINTS_IN_PART = 1 << 20
+"""Points summed at once: their keys and columns take some 100 MB."""
 _Sums: TypeAlias = tuple[Ints, list[Floats]]
 """Keys of voxels (K,), and columns (K,) of sums."""
 
