@@ -183,7 +183,7 @@ def test_lengths_of_a_graph_without_a_scale_are_no_metres(wrong_edge: tuple[Path
     folder = wrong_edge[0]
     subject = open_subject(folder / "ring.g2o")
     metric = (folder / "why/diagnosis.html").read_text()
-    write_diagnosed(folder / "own", diagnose_subject(replace(subject, has_metres=False)), recording=False)
+    write_diagnosed(folder / "own", diagnose_subject(replace(subject, has_metres=False)))
     page = re.sub(r"base64,[^\"]*", "", (folder / "own/diagnosis.html").read_text())
     lengths = r"\d (c?m|m²)\b"
     assert re.search(lengths, metric) and not re.search(lengths, page) and "units" in page

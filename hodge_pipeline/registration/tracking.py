@@ -38,6 +38,8 @@ MISPLACED = 0.2
 motion taken where it halves that share. Of a bare room whose corners lie on an object, half of the frames have 0.6 and
 more; 3 in 4 of red kitchen's and of fr1/rpy's, where nothing moves, less than 0.15.
 """
+KEPT_FITNESS = 0.5
+"""Share of a cloud on the key frame's below which a registration is tried from elsewhere too: most of it is new."""
 CORNERS_A_SAMPLE = 75.0
 """Corners that count as one independent measurement, as matches of landmarks do."""
 
@@ -45,14 +47,13 @@ CORNERS_A_SAMPLE = 75.0
 @dataclass(frozen=True)
 class TrackingOptions:
     """How frames are followed: `clouds` of key frames; a frame that has moved `distance_m` or `angle_rad` from the last
-    key frame becomes one, and so does, where clouds are registered, one that shares less than `kept_fitness` with it.
+    key frame becomes one, and so does, where clouds are registered, one that shares less than `KEPT_FITNESS` with it.
     """
 
     clouds: CloudOptions
     odometry: OdometryOptions
     distance_m: float
     angle_rad: float
-    kept_fitness: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -272,7 +273,7 @@ class _Tracker:
     def _registered_by_clouds(self, view: TrackedFrame) -> Registration:
         """The motion by the registrar of odometry."""
         found = self._confirmed(self._keys[-1], view, self._registered(self._keys[-1], view, self._key_from_last))
-        if found.fitness < self._options.kept_fitness and self._last.place != self._keys[-1].place:
+        if found.fitness < KEPT_FITNESS and self._last.place != self._keys[-1].place:
             found = self._from_last(view, found)
         if not self._is_good(found) and self._missed is not None:
             found = self._from_missed(view, self._missed, found)
@@ -328,7 +329,7 @@ class _Tracker:
     def _registered(self, target: TrackedFrame, source: TrackedFrame, standing: Floats) -> Registration:
         """From a motion that goes on as before and, where that may not have worked, from `standing`, that of none."""
         step = self._registrar.register(target.prepared, source.prepared, standing @ self._ahead(source))
-        if step.fitness < self._options.kept_fitness:
+        if step.fitness < KEPT_FITNESS:
             again = self._registrar.register(target.prepared, source.prepared, standing)
             step = again if again.fitness > step.fitness else step
         return step

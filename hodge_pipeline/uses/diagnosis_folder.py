@@ -26,7 +26,7 @@ PICTURED, LEAST_PICTURED = 6, 2
 """Edges that the page shows in pictures: those that are not consistent, at most and at least so many."""
 
 
-def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) -> None:
+def write_diagnosed(out: Path, diagnosed: Diagnosed) -> None:
     """Write `edges.csv`, `poses.tum`, `diagnosis.html` and `diagnosis.rrd` into a folder, made if it is not there."""
     make_folder(out)
     subject, found = diagnosed.subject, diagnosed.diagnosis
@@ -35,10 +35,9 @@ def write_diagnosed(out: Path, diagnosed: Diagnosed, *, recording: bool = True) 
     write_edges(out / "edges.csv", edges, names, has_metres=subject.has_metres)
     _write_poses(out / "poses.tum", subject, found)
     artifacts.write_text(out / "diagnosis.html", render(document(_page(diagnosed))))
-    if recording:
-        identity = hashlib.sha256(np.ascontiguousarray(found.world_from_cam).tobytes()).hexdigest()[:32]
-        placed = pieces_apart(found.world_from_cam, found.piece)
-        write_diagnosis(out / "diagnosis.rrd", identity, subject.graph, placed, found)
+    identity = hashlib.sha256(np.ascontiguousarray(found.world_from_cam).tobytes()).hexdigest()[:32]
+    placed = pieces_apart(found.world_from_cam, found.piece)
+    write_diagnosis(out / "diagnosis.rrd", identity, subject.graph, placed, found)
 
 
 def _write_poses(path: Path, subject: DiagnosisSubject, found: Diagnosis) -> None:
