@@ -210,7 +210,7 @@ class ColmapModel:
         return 0 if database is None else held_apart(self.reconstruction, database, self.edges.min_shared)
 
     def resected(self, bodies: Bools | None = None) -> Floats:
-        """Poses (B, 4, 4): those of these bodies (B,), all by default, by the points; see `colmap_resection`."""
+        """Poses (B, 4, 4): those of these bodies (B,), all by default, by the points; see `resection`."""
         return resected(self.records, self.bodies, bodies)
 
     @property
@@ -278,7 +278,7 @@ class ColmapModel:
     def adjusted(
         self, priors: PositionPriors | None = None, *, move_bodies: bool = True, near_optimum: bool = False
     ) -> ColmapModel:
-        """Bundle adjustment with rigs held, and intrinsics unless they are to be refined; see `colmap_bundle`.
+        """Bundle adjustment with rigs held, and intrinsics unless they are to be refined; see `bundle.adjust`.
 
         Where it leaves a few points behind their cameras, those are placed anew and all is adjusted once more.
         """
@@ -331,7 +331,7 @@ class ColmapModel:
         return [(self.records.images[row].image_id, int(column)) for row, column in keypoints]
 
     def standard_errors(self) -> Floats:
-        """Of each body's rotation and position (B, 2), radians and units; see `colmap_uncertainty`."""
+        """Of each body's rotation and position (B, 2), radians and units; see `uncertainty.standard_errors`."""
         return self._standard_errors
 
     @cached_property
