@@ -98,9 +98,10 @@ def read_pose(path: Path, units_per_metre: float) -> Floats | None:
     if any(len(vector) != 3 for vector in found):
         return None
     position, ahead, up = np.array(found)
+    if not np.isfinite(position).all() or not np.abs([ahead, up]).max() < 1e9:  # of nan too
+        return None
     right = np.cross(up, ahead)
-    lengths = np.linalg.norm([ahead, up, right], axis=1)
-    if not np.isfinite([position, ahead, right]).all() or not ((lengths > 1e-9) & (lengths < 1e9)).all():
+    if not (np.linalg.norm([ahead, up, right], axis=1) > 1e-9).all():
         return None
     z, x = ahead / np.linalg.norm(ahead), right / np.linalg.norm(right)
     return se3.from_parts(np.column_stack([x, np.cross(z, x), z]), position / units_per_metre)
