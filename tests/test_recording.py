@@ -22,6 +22,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.recipe.recording_options import SHARES, RecordingOptions
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.frames import image_rows
+from hodge_pipeline.recording.results import level_of
 from hodge_pipeline.types import (
     Camera,
     CloudSet,
@@ -373,3 +374,12 @@ def test_a_recording_without_room_is_one_line_and_never_waits_for_ever(
     done = subprocess.run([sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True, timeout=300)
     assert "the recording cannot be written" in done.stdout and done.returncode == 0, done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_line_of_the_log_has_the_level_that_it_was_logged_with() -> None:
+    lines = ("the error of the trajectory is 2 cm", "a warning is no ERROR", "stopped")
+    levels = [
+        level_of(f"2026-01-01 10:00:00,000 {name} {line}")
+        for name, line in zip(("INFO", "WARNING", "ERROR"), lines, strict=True)
+    ]
+    assert levels == ["INFO", "WARN", "ERROR"] and level_of("") == level_of("an error on its own") == "INFO"

@@ -19,6 +19,9 @@ MODEL_POINTS = 250_000
 POINT_RADIUS = -1.2
 """Negative: points on the screen."""
 
+LEVELS = {"WARNING": "WARN", "ERROR": "ERROR", "CRITICAL": "CRITICAL", "DEBUG": "DEBUG"}
+"""Rerun's words for those of `logging`; the others are INFO."""
+
 
 def log_model(part: Part, model: Model, path: str = layout.MODEL) -> None:
     """Log the fused scene as a static mesh or point cloud."""
@@ -75,6 +78,6 @@ def log_text(part: Part, recipe: str, log_lines: Sequence[str], slots: int) -> N
 
 
 def level_of(line: str) -> str:
-    """The log level of a line, by the words in it."""
-    lower = line.lower()
-    return "ERROR" if "error" in lower else "WARN" if "warning" in lower else "INFO"
+    """The level of a line of a run's log, which stands behind its date and time."""
+    words = line.split(maxsplit=3)
+    return LEVELS.get(words[2] if len(words) > 2 else "", "INFO")
