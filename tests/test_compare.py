@@ -14,6 +14,7 @@ from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import WorkspaceError
 from hodge_pipeline.recording import layout
 from hodge_pipeline.report.contents import Report, SourceSummary
+from hodge_pipeline.report.verdict import judge
 from hodge_pipeline.run_folder import Ending, Run
 from hodge_pipeline.scene import KeyFrames
 from hodge_pipeline.types import CloudSet, Floats, Frame, Model, Source
@@ -54,6 +55,7 @@ def test_a_run_moved_as_one_body_is_the_same_run(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.a_from_b, se3.inverse(MOVED), atol=1e-6)
     measured, options = tables(found)
     assert measured.rows[0] == ("frames", "12", "12", "")
+    assert measured.rows[1] == ("verdict", *(judge(report).headline for report in found.reports), "")
     assert {row[0]: row[2] for row in measured.rows}["poses apart, largest"] == "0"
     assert options.rows == ()
 

@@ -114,6 +114,7 @@ def _measured(comparison: Comparison) -> Iterator[tuple[str, ...]]:
     a, b = comparison.reports
     floor_m = floor_of(comparison.a.poses[:, :3, 3], comparison.b.poses[:, :3, 3])
     yield "frames", str(a.source.frames), str(b.source.frames), ""
+    yield "verdict", judge(a).headline, judge(b).headline, ""  # with its doubts, as of the truth's clock
     for label, quantity, is_length in _QUANTITIES:
         before, after = _finite(quantity(a)), _finite(quantity(b))
         if before is not None or after is not None:
