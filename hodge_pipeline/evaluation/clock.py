@@ -18,6 +18,7 @@ GAPS = 3.0
 MOST_MOMENTS = 200_000
 """Moments on which motions are compared; a longer trajectory is sampled more coarsely."""
 FEWEST_FRAMES = 10
+"""With a pose, and of the reference: some motions that overlap are needed under each shift."""
 BETTER = 0.5
 """A shift explains the poses if it leaves less than half of the motion, and of the error, that is left without."""
 FINER = 9

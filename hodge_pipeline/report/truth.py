@@ -15,6 +15,7 @@ from hodge_pipeline.types import Floats, Source
 from hodge_pipeline.types.notes import Note
 
 SAME_POSE = 1e-6
+"""Entries of poses that differ by less are the same: rounding."""
 
 
 def truth_doubts(

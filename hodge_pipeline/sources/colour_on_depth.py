@@ -12,12 +12,11 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.depth_units import SAMPLED_FRAMES, doubts_of
 from hodge_pipeline.types import Bytes, Floats, Floats32, Frame
 from hodge_pipeline.types.arrays import evenly
+from hodge_pipeline.types.image_edges import FEWEST_EDGES, change_along_rows, depth_edges
 from hodge_pipeline.types.notes import Note
 
-FEWEST_FRAMES, FEWEST_EDGES = 5, 100
-"""Frames that are needed; pixels at depth edges that a frame needs."""
-EDGE_STEP = 0.05
-"""Share of the nearer depth by which neighbouring pixels differ at a depth edge."""
+FEWEST_FRAMES = 5
+"""Frames that are needed: the error of a mean of fewer is hardly known."""
 STRONG = 0.98
 """Quantile of the colour's change from which on edges count alike, so that no window or screen decides alone."""
 CELLS, FARTHEST, NEAR = 160, 10, 2
@@ -26,6 +25,7 @@ calibrated camera's may be off, 8 pixels of 640."""
 SCALES = np.exp(0.05 * np.arange(-3, 4))
 """About the middle of the image: a Kinect's depth camera sees 0.90 of the angle of its colour camera."""
 NEAR_SCALES = slice(2, 5)
+"""Within 5 %, which a calibrated camera's scale may be off."""
 SURE = 2.5
 """Standard errors of the mean over the frames, each measured at the best place of the other ones."""
 BETTER = 1.25
@@ -85,7 +85,7 @@ def _at_best(agreement: Floats, row: int) -> float:
 def agreement(depth_m: Floats32, colour: Bytes) -> list[Agreement]:
     """That of one frame; none of too few depth edges, or of colour of one shade or another size."""
     height, width = depth_m.shape
-    rows, columns = _edges(depth_m)
+    rows, columns, _ = depth_edges(depth_m)
     if colour.shape[:2] != depth_m.shape or len(rows) < FEWEST_EDGES:
         return []
     cell = max(width // CELLS, 1)
@@ -97,7 +97,7 @@ def agreement(depth_m: Floats32, colour: Bytes) -> list[Agreement]:
     of_colour, out = np.fft.rfft2(change, padded), np.zeros((len(SCALES), 2 * FARTHEST + 1, 2 * FARTHEST + 1))
     middle = np.array([height / 2, width / 2])
     for number, scale in enumerate(SCALES):
-        places = ((np.stack([rows, columns], axis=1) - middle) * scale + middle) / cell
+        places = ((np.stack([rows, columns + 0.5], axis=1) - middle) * scale + middle) / cell
         inside = ((places >= 0) & (places < size)).all(axis=1)
         cells = places[inside].astype(np.int64)
         edges = np.bincount(cells @ [padded[1], 1], minlength=padded[0] * padded[1]).reshape(padded)
@@ -107,18 +107,9 @@ def agreement(depth_m: Floats32, colour: Bytes) -> list[Agreement]:
     return [Agreement(out, cell)]
 
 
-def _edges(depth_m: Floats32) -> tuple[Floats, Floats]:
-    """Rows and columns between neighbours in a row of which one is clearly nearer."""
-    left, right = depth_m[:, :-1], depth_m[:, 1:]
-    nearer = np.minimum(left, right)
-    rows, columns = np.nonzero((nearer > 0) & (np.abs(left - right) > EDGE_STEP * nearer))
-    return np.asarray(rows, float), np.asarray(columns + 0.5, float)
-
-
 def _change(colour: Bytes, size: tuple[int, int]) -> Floats:
     """The change of colour along rows in cells (rows, columns), of mean 0 and standard deviation 1; 0 without any."""
-    grey = cv2.blur(cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), (3, 3))
-    change = np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0))
+    change = change_along_rows(colour)
     change = np.sqrt(np.minimum(change, np.quantile(change, STRONG)))
     cells = np.asarray(cv2.resize(change, size[::-1], interpolation=cv2.INTER_AREA), float)
     cells -= cells.mean()

@@ -16,6 +16,7 @@ from hodge_adapters.images.frames import as_jpeg
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bytes, Camera, EncodedImage, Floats, Floats32
 from hodge_pipeline.types.arrays import evenly
+from hodge_pipeline.types.image_edges import FEWEST_EDGES, change_along_rows, depth_edges
 
 COLOUR_FOCAL, BASELINE_M = 525.0, 0.025
 """Focal length in pixels and baseline of a Kinect's colour camera as built: parallel to the depth camera."""
@@ -24,10 +25,8 @@ ASSUMED_DEPTH_M = 2.0
 """Depth that an image without any is taken to have."""
 MEDIAN_STRIDE = 4
 """Every so many rows and columns are used for the median depth: all would take as long as the rest."""
-FRAMES, FEWEST_FRAMES, FEWEST_EDGES = 8, 3, 100
-"""Frames tested, evenly spread; frames that are needed; pixels at depth edges that a frame needs."""
-EDGE_STEP = 0.05
-"""Share of the nearer depth by which neighbouring pixels differ at a depth edge."""
+FRAMES, FEWEST_FRAMES = 8, 3
+"""Frames tested, evenly spread; frames that are needed."""
 LEAST_CHANGE = 1.0
 """Grey levels added for noise, so that an image of one even shade has no say."""
 SURE = 2.5
@@ -79,13 +78,9 @@ def _gain(depth_m: Floats32, colour: Bytes, camera: Camera) -> float:
     """Logarithm of the mean gradient of colour at depth edges as a Kinect's colour camera sees them, over that at their
     own pixels; NaN with too few edges.
     """
-    grey = cv2.blur(cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), (3, 3))
-    change = np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0))
-    left, right = depth_m[:, :-1], depth_m[:, 1:]
-    nearer = np.minimum(left, right)
-    v, u = np.nonzero((nearer > 0) & (np.abs(left - right) > EDGE_STEP * nearer))
+    change, (v, u, nearer_m) = change_along_rows(colour), depth_edges(depth_m)
     far = _at_infinity(np.asarray(u + 0.5, float), v.astype(float), camera)
-    columns = np.round(far[0] - COLOUR_FOCAL * BASELINE_M / nearer[v, u]).astype(np.int64)
+    columns = np.round(far[0] - COLOUR_FOCAL * BASELINE_M / nearer_m).astype(np.int64)
     rows = np.round(far[1]).astype(np.int64)
     inside = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
     if inside.sum() < FEWEST_EDGES:
