@@ -14,9 +14,10 @@ import pycolmap
 import pytest
 
 from hodge_adapters.colmap.cameras import pinhole_camera, undistortion
+from hodge_adapters.colmap.content import content_of
 from hodge_adapters.colmap.files import by_report
 from hodge_adapters.colmap.reader import ColmapReader
-from hodge_adapters.colmap.records import CameraRecord
+from hodge_adapters.colmap.records import NO_POINT, CameraRecord
 from hodge_adapters.colmap.writer import ColmapWriter
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -132,6 +133,27 @@ def test_an_image_without_a_name_has_no_depth(tmp_path: Path, name: str) -> None
     (tmp_path / "depth").mkdir()
     source = ColmapReader(edges="none").open(text_model(tmp_path / "model", name=name))
     assert source.frames[0].read_depth is None and any("not there as files" in note for note in source.notes)
+
+
+def test_content_is_what_pycolmap_gives_object_by_object(tmp_path: Path) -> None:
+    synthetic(tmp_path)
+    model = pycolmap.Reconstruction(tmp_path / "text")
+    model.delete_point3D(max(model.points3D))
+    model.deregister_frame(model.reg_frame_ids()[1])
+    content, posed = content_of(model), set(model.reg_image_ids())
+    assert len(content.images) == len(posed) < model.num_images()
+    for record in content.images:
+        seen = model.images[record.image_id].points2D
+        np.testing.assert_array_equal(record.pixels, [point.xy for point in seen])
+        assert record.point_ids.tolist() == [p.point3D_id if p.has_point3D() else NO_POINT for p in seen]
+    assert (np.concatenate([record.point_ids for record in content.images]) == NO_POINT).any()
+    points = content.points
+    assert points.ids.tolist() == sorted(model.points3D)
+    for row, point_id in enumerate(points.ids.tolist()):
+        here, point = slice(points.offsets[row], points.offsets[row + 1]), model.points3D[point_id]
+        np.testing.assert_array_equal(points.xyz[row], point.xyz)
+        own = zip(points.image_ids[here].tolist(), points.columns[here].tolist(), strict=True)
+        assert [*own] == [(e.image_id, e.point2D_idx) for e in point.track.elements if e.image_id in posed]
 
 
 def test_what_a_report_leads_to_is_told(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hodge_adapters.colmap.binary import content_arrays
 from hodge_adapters.colmap.check import REMEDY, check_files, check_words, names_with_blanks
 from hodge_adapters.colmap.files import MODEL_FILES, model_ending
 from hodge_adapters.colmap.pycolmap_import import pycolmap
@@ -85,13 +86,22 @@ def read_reconstruction(folder: Path) -> pycolmap.Reconstruction:
 
 def content_of(reconstruction: pycolmap.Reconstruction, tracks: bool = True) -> Model:
     """The posed images in natural order of their names, their cameras, and the points with their tracks."""
-    posed = (reconstruction.images[image_id] for image_id in reconstruction.reg_image_ids())
-    images = [_image(image, tracks) for image in sorted(posed, key=lambda image: natural(image.name))]
+    posed = sorted(
+        (reconstruction.images[image_id] for image_id in reconstruction.reg_image_ids()),
+        key=lambda image: natural(image.name),
+    )
+    poses = [_pose(image) for image in posed]
+    seen, points = content_arrays(reconstruction)
+    nothing = np.zeros((0, 2)), np.zeros(0, np.int64)
+    images = [
+        ImageRecord(one.image_id, pose, one.camera_id, one.name, *(seen[one.image_id] if tracks else nothing))
+        for one, pose in zip(posed, poses, strict=True)
+    ]
     cameras = {
         key: CameraRecord(key, camera.model.name, camera.width, camera.height, tuple(camera.params))
         for key, camera in reconstruction.cameras.items()
     }
-    return Model(cameras, images, _points(reconstruction, {image.image_id for image in images}))
+    return Model(cameras, images, _seen_by(points, [image.image_id for image in images]))
 
 
 def checked_content(reconstruction: pycolmap.Reconstruction, where: Path, tracks: bool = True) -> Model:
@@ -100,10 +110,11 @@ def checked_content(reconstruction: pycolmap.Reconstruction, where: Path, tracks
     Raises `SourceError`.
     """
     try:
-        lost = [key for key, point in reconstruction.points3D.items() if not np.isfinite(point.xyz).all()]
+        content = content_of(reconstruction, tracks)
+        lost = content.points.ids[~np.isfinite(content.points.xyz).all(axis=1)].tolist()
         for key in lost:
             reconstruction.delete_point3D(key)
-        content = content_of(reconstruction, tracks)
+        content = content_of(reconstruction, tracks) if lost else content
     except UnicodeDecodeError as error:
         raise SourceError(f"{where}: the name of an image is no UTF-8: {REMEDY}") from error
     except OverflowError as error:
@@ -122,21 +133,21 @@ def checked_content(reconstruction: pycolmap.Reconstruction, where: Path, tracks
     return replace(content, notes=(f"{counted(len(lost), 'point')} not finite: left out",)) if lost else content
 
 
-def refreshed(model: Model, reconstruction: pycolmap.Reconstruction) -> Model:
+def refreshed(model: Model, reconstruction: pycolmap.Reconstruction, xyz: Floats | None = None) -> Model:
     """The content with the poses and positions of a reconstruction of the same images and points.
 
-    A point that the reconstruction lost stays where it was.
+    A point that the reconstruction lost stays where it was. `xyz (P, 3)`: its positions, where they are known already.
     """
-    points3d = reconstruction.points3D
-    xyz = model.points.xyz.copy()
-    for row, point_id in enumerate(model.points.ids.tolist()):
-        if point_id in points3d:
-            xyz[row] = points3d[point_id].xyz
+    if xyz is None:
+        points3d, xyz = reconstruction.points3D, model.points.xyz.copy()
+        for row, point_id in enumerate(model.points.ids.tolist()):
+            if point_id in points3d:
+                xyz[row] = points3d[point_id].xyz
     images = [replace(image, world_from_cam=_pose(reconstruction.images[image.image_id])) for image in model.images]
     cameras = {
         key: replace(record, params=tuple(reconstruction.cameras[key].params)) for key, record in model.cameras.items()
     }
-    return replace(model, cameras=cameras, images=images, points=replace(model.points, xyz=xyz))
+    return model.moved(cameras, images, xyz)
 
 
 def _rig_files(folder: Path, ending: str) -> tuple[Path, ...]:
@@ -181,11 +192,10 @@ def _check(model: Model, where: Path) -> None:
     twice = [name for name, after in pairwise(names) if name == after]
     if twice:
         raise SourceError(f"{where}: two images have the name {twice[0]!r}: rename one, or leave it out")
-    known = np.append(model.points.ids, NO_POINT)
     for image in model.images:
         if not np.isfinite(image.pixels).all():
             raise SourceError(f"{where}: image {image.name!r}: an observation is not finite: reconstruct it again")
-        lost = image.point_ids[~np.isin(image.point_ids, known)]
+        lost = image.point_ids[(image.point_ids != NO_POINT) & (model.points.rows_of(image.point_ids) < 0)]
         if lost.size:
             raise SourceError(f"{where}: image {image.name!r} observes point {lost[0]}, which is not there: {REMEDY}")
 
@@ -195,29 +205,10 @@ def _pose(image: pycolmap.Image) -> Floats:
     return se3.inverse(matrix_of(image.cam_from_world()))
 
 
-def _image(image: pycolmap.Image, tracks: bool) -> ImageRecord:
-    invalid = pycolmap.INVALID_POINT3D_ID
-    points = list(image.points2D) if tracks else []
-    pixels = np.array([(point.x(), point.y()) for point in points], np.float64).reshape(-1, 2)
-    ids = (point.point3D_id for point in points)
-    point_ids = np.fromiter((NO_POINT if one == invalid else one for one in ids), np.int64, len(points))
-    return ImageRecord(image.image_id, _pose(image), image.camera_id, image.name, pixels, point_ids)
-
-
-def _points(reconstruction: pycolmap.Reconstruction, posed: set[int]) -> Points:
-    """The points; what an image without a pose saw of them tells nothing."""
-    ids, xyz, counts, image_ids, columns = [], [], [], [], []
-    for key, point in sorted(reconstruction.points3D.items()):
-        ids.append(key)
-        xyz.append(point.xyz)
-        seen = [(one.image_id, one.point2D_idx) for one in point.track.elements if one.image_id in posed]
-        counts.append(len(seen))
-        image_ids += [one for one, _ in seen]
-        columns += [one for _, one in seen]
-    return Points(
-        ids=np.array(ids, np.int64),
-        xyz=np.array(xyz, np.float64).reshape(-1, 3),
-        offsets=np.concatenate([[0], np.cumsum(np.array(counts, np.int64))]).astype(np.int64),
-        image_ids=np.array(image_ids, np.int64),
-        columns=np.array(columns, np.int64),
-    )
+def _seen_by(points: Points, image_ids: Sequence[int]) -> Points:
+    """The points with the entries of these images alone: what an image without a pose saw tells nothing."""
+    kept = np.isin(points.image_ids, image_ids)
+    if kept.all():
+        return points
+    offsets = np.concatenate([[0], np.cumsum(kept)])[points.offsets].astype(np.int64)
+    return replace(points, offsets=offsets, image_ids=points.image_ids[kept], columns=points.columns[kept])

@@ -85,10 +85,10 @@ def covisible_pairs(model: Model, min_shared: int, max_per_image: int) -> Iterat
     """Pairs of images that share enough points, those with most first for each image; i < j."""
     cameras = camera_table(model)
     shared = shared_counts(model)
+    seen = [np.unique(image.point_ids, return_index=True) for image in model.images]
     for i, j in _most_shared(shared, min_shared, max_per_image):
         first, second = model.images[i], model.images[j]
-        ids_i, at_i = np.unique(first.point_ids, return_index=True)
-        ids_j, at_j = np.unique(second.point_ids, return_index=True)
+        (ids_i, at_i), (ids_j, at_j) = seen[i], seen[j]
         common, rows_i, rows_j = np.intersect1d(ids_i, ids_j, assume_unique=True, return_indices=True)
         real = common != NO_POINT
         sighting = Sighting(
@@ -108,12 +108,11 @@ def camera_table(model: Model) -> Mapping[int, pycolmap.Camera]:
 
 def positions(model: Model, point_ids: Ints) -> Floats:
     """Positions (N, 3) of points by id, NaN for those that the model does not have."""
-    points = model.points
-    if not len(points.ids):
-        return np.full((len(point_ids), 3), np.nan)
-    order = np.argsort(points.ids)
-    rows = order[np.clip(np.searchsorted(points.ids[order], point_ids), 0, len(order) - 1)]
-    return np.where((points.ids[rows] == point_ids)[:, None], points.xyz[rows], np.nan)
+    rows = model.points.rows_of(point_ids)
+    known = rows >= 0
+    out = np.full((len(point_ids), 3), np.nan)
+    out[known] = model.points.xyz[rows[known]]
+    return out
 
 
 def shared_counts(model: Model) -> coo_array:

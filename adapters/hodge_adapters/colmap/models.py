@@ -209,7 +209,7 @@ def _unposed(reconstruction: pycolmap.Reconstruction) -> list[str]:
 
 
 def _joined(whole: ColmapModel, other: ColmapModel) -> ColmapModel | None:
-    ties = tie_points(whole.reconstruction, other.reconstruction, whole.edges.database)
+    ties = tie_points(whole.records, other.records, whole.edges.database)
     found = similarity(whole.reconstruction, other.reconstruction, ties)
     if found is None:
         return None

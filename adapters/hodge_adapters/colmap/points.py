@@ -132,7 +132,7 @@ def with_points(model: Model, kept: Bools) -> Model:
         columns=points.columns[entries],
     )
     images = [
-        replace(image, point_ids=np.where(np.isin(image.point_ids, left.ids), image.point_ids, NO_POINT))
+        replace(image, point_ids=np.where(left.rows_of(image.point_ids) >= 0, image.point_ids, NO_POINT))
         for image in model.images
     ]
     return replace(model, images=images, points=left)
@@ -144,14 +144,12 @@ def error_cap(errors_px: Floats) -> float:
     return max(LEAST_CAP_PX, CAP_MEDIANS * float(np.median(seen))) if len(seen) else LEAST_CAP_PX
 
 
-def reprojection_errors(model: Model) -> tuple[Ints, Floats]:
-    """Every observation of a track: the row of its image and its column there (N, 2), and its error (N,) in pixels.
-
-    Infinite where the point lies behind the camera, so that the camera cannot project it.
+def reprojection_errors(model: Model) -> Floats:
+    """The error (T,) in pixels of each entry of a track; infinite where the point lies behind the camera, so that the
+    camera cannot project it.
     """
-    points = model.points
-    row, owner = model.image_rows, points.owners
-    errors_px = np.full(len(row), np.inf)
+    points, owner = model.points, model.points.owners
+    errors_px = np.full(len(owner), np.inf)
     for image, here in zip(model.images, model.entries, strict=True):
         if not len(here):
             continue
@@ -159,7 +157,7 @@ def reprojection_errors(model: Model) -> tuple[Ints, Floats]:
         projected = np.asarray(colmap_camera(model.cameras[image.camera_id]).img_from_cam(in_cam))
         distance_px = np.linalg.norm(projected - image.pixels[points.columns[here]], axis=1)
         errors_px[here] = np.where(np.isfinite(distance_px), distance_px, np.inf)
-    return np.stack([row, points.columns], axis=1).astype(np.int64), errors_px
+    return errors_px
 
 
 def update_errors(reconstruction: pycolmap.Reconstruction) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 from hodge_pipeline.types import Floats, Ints
 
 NO_POINT = -1
+"""COLMAP's mark of an observation of no point, 2^64 − 1, as a signed number."""
 
 
 def matrix_of(motion: Any) -> Floats:
@@ -45,7 +46,9 @@ class ImageRecord:
 
 @dataclass(frozen=True)
 class Points:
-    """The model's points: `ids (P,)`, `xyz (P, 3)`, and each one's track as `image_ids`, `columns` cut by `offsets`."""
+    """The model's points: `ids (P,)`, ascending, `xyz (P, 3)`, and each one's track as `image_ids`, `columns` cut by
+    `offsets`.
+    """
 
     ids: Ints
     xyz: Floats
@@ -57,6 +60,13 @@ class Points:
     def owners(self) -> Ints:
         """The row (T,) of the point that each entry of a track belongs to."""
         return np.repeat(np.arange(len(self.ids)), np.diff(self.offsets))
+
+    def rows_of(self, ids: Ints) -> Ints:
+        """The rows (N,) of points by their ids (N,), −1 of those that are not there."""
+        if not len(self.ids):
+            return np.full(len(ids), -1)
+        rows = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
+        return np.where(self.ids[rows] == ids, rows, -1)
 
 
 @dataclass(frozen=True)
@@ -81,3 +91,22 @@ class Model:
         """The rows of the entries of tracks that name each image, ascending."""
         order = np.argsort(self.image_rows, kind="stable")
         return np.split(order, np.searchsorted(self.image_rows[order], np.arange(1, len(self.images))))
+
+    @cached_property
+    def keypoints(self) -> Ints:
+        """For each entry of a track the row of its image and the number of its observation there (T, 2)."""
+        return np.stack([self.image_rows, self.points.columns], axis=1).astype(np.int64)
+
+    @cached_property
+    def track_lengths(self) -> Ints:
+        """For each entry of a track how many entries the track has (T,)."""
+        return np.diff(self.points.offsets)[self.points.owners]
+
+    def moved(self, cameras: Mapping[int, CameraRecord], images: Sequence[ImageRecord], xyz: Floats) -> Model:
+        """The same tracks with other cameras, poses and positions (P, 3); what tracks alone tell is not found anew."""
+        out = replace(self, cameras=cameras, images=images, points=replace(self.points, xyz=xyz))
+        vars(out.points)["owners"] = self.points.owners
+        vars(out).update(
+            {name: getattr(self, name) for name in ("image_rows", "entries", "keypoints", "track_lengths")}
+        )
+        return out

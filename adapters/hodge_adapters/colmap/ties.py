@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hodge_adapters.colmap.database import database_matches
+from hodge_adapters.colmap.edges import shared_counts
 from hodge_adapters.colmap.points import nearest_to_rays
 from hodge_adapters.colmap.pycolmap_import import pycolmap
-from hodge_adapters.colmap.records import NO_POINT
+from hodge_adapters.colmap.records import NO_POINT, Model
 from hodge_pipeline.types import Floats, Ints
 
 MERGE_ERROR_PX = 4.0
@@ -24,27 +25,19 @@ REFITS = 5
 """Each to the better half, as least trimmed squares concentrate."""
 
 
-def point_ids_by_name(reconstruction: pycolmap.Reconstruction) -> dict[str, Ints]:
-    """The point of each keypoint of each posed image, `NO_POINT` where it has none."""
-    invalid = pycolmap.INVALID_POINT3D_ID
-    out = {}
-    for image_id in reconstruction.reg_image_ids():
-        image = reconstruction.images[image_id]
-        ids = (NO_POINT if p.point3D_id == invalid else p.point3D_id for p in image.points2D)
-        out[image.name] = np.fromiter(ids, np.int64, image.num_points2D())
-    return out
-
-
-def merge_matched_points(reconstruction: pycolmap.Reconstruction, database: Path, min_shared: int) -> int:
-    """How many pairs of points that a match calls one were merged, where one position serves all their images.
+def merge_matched_points(
+    reconstruction: pycolmap.Reconstruction, content: Model, database: Path, min_shared: int
+) -> int:
+    """How many pairs of points that a match calls one were merged, where one position serves all their images;
+    `content`: the reconstruction's.
 
     Only between images that the database matches well and the model holds apart: the ends of a chain that should meet,
     two models just joined. What COLMAP did not merge elsewhere it had reason to leave.
     """
-    of_name = point_ids_by_name(reconstruction)
+    ids = [image.point_ids for image in content.images]
     merged: dict[int, int] = {}
     count = 0
-    for a, b in _matched_points(of_name, of_name, database, min_shared):
+    for a, b in _matched_points(ids, ids, apart_matches(content, database, min_shared)):
         first, second = _current(merged, a), _current(merged, b)
         xyz = None if first == second else _common_position(reconstruction, first, second)
         if xyz is None:
@@ -57,17 +50,21 @@ def merge_matched_points(reconstruction: pycolmap.Reconstruction, database: Path
     return count
 
 
-def held_apart(reconstruction: pycolmap.Reconstruction, database: Path, min_shared: int) -> int:
-    """How many pairs of images the database matches well while the model holds them apart."""
-    of_name = point_ids_by_name(reconstruction)
-    names = list(of_name)
-    pairs = database_matches(database, {name: row for row, name in enumerate(names)})
-    return sum(_is_apart(of_name[names[i]], of_name[names[j]], len(matches), min_shared) for i, j, matches in pairs)
+def apart_matches(content: Model, database: Path, min_shared: int) -> Iterator[tuple[int, int, Ints]]:
+    """Rows of two images that the database matches well while the model holds them apart, and what matches."""
+    shared = shared_counts(content)
+    pairs = zip(shared.row.tolist(), shared.col.tolist(), strict=True)
+    count = dict(zip(pairs, shared.data.tolist(), strict=True))
+    rows = {image.name: row for row, image in enumerate(content.images)}
+    for i, j, matches in database_matches(database, rows):
+        if len(matches) >= min_shared and 2 * count.get((min(i, j), max(i, j)), 0) < min_shared:
+            yield i, j, matches
 
 
-def tie_points(first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, database: Path | None) -> Ints:
+def tie_points(first: Model, second: Model, database: Path | None) -> Ints:
     """The ids (T, 2) of points of two models that a match, or an image in both, calls one."""
-    of_first, of_second = point_ids_by_name(first), point_ids_by_name(second)
+    names = list(dict.fromkeys(image.name for model in (first, second) for image in model.images))
+    of_first, of_second = ({image.name: image.point_ids for image in model.images} for model in (first, second))
     pairs: set[tuple[int, int]] = set()
     for name in of_first.keys() & of_second.keys():
         a, b = of_first[name], of_second[name]
@@ -75,7 +72,9 @@ def tie_points(first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, 
             both = (a != NO_POINT) & (b != NO_POINT)
             pairs.update(zip(a[both].tolist(), b[both].tolist(), strict=True))
     if database is not None:
-        pairs.update(_matched_points(of_first, of_second, database))
+        matches = database_matches(database, {name: row for row, name in enumerate(names)})
+        here, there = ([of.get(name, np.zeros(0, np.int64)) for name in names] for of in (of_first, of_second))
+        pairs.update(_matched_points(here, there, matches))
     return np.array(sorted(pairs), np.int64).reshape(-1, 2)
 
 
@@ -112,21 +111,15 @@ def _refitted(motion: pycolmap.Sim3d, there: Floats, here: Floats, mask: Any) ->
 
 
 def _matched_points(
-    of_first: dict[str, Ints], of_second: dict[str, Ints], database: Path, min_shared: int = 0
+    of_first: list[Ints], of_second: list[Ints], found: Iterable[tuple[int, int, Ints]]
 ) -> Iterator[tuple[int, int]]:
-    """Distinct pairs of different points that matched keypoints of the two sets of images belong to.
-
-    With `min_shared`: only of pairs of images with so many matches that share less than half so many points.
+    """Distinct pairs of different points that matched keypoints of two models belong to, by the points of each row of
+    images.
     """
-    names = list(dict.fromkeys([*of_first, *of_second]))
     seen = set()
-    for i, j, matches in database_matches(database, {name: row for row, name in enumerate(names)}):
-        if min_shared and not _is_apart(of_first[names[i]], of_first[names[j]], len(matches), min_shared):
-            continue
-        for one, other, columns in ((names[i], names[j], matches), (names[j], names[i], matches[:, ::-1])):
-            a, b = of_first.get(one), of_second.get(other)
-            if a is None or b is None or not len(columns):
-                continue
+    for i, j, matches in found:
+        for one, other, columns in ((i, j, matches), (j, i, matches[:, ::-1])):
+            a, b = of_first[one], of_second[other]
             inside = (columns[:, 0] < len(a)) & (columns[:, 1] < len(b))
             first, second = a[columns[inside, 0]], b[columns[inside, 1]]
             both = (first != NO_POINT) & (second != NO_POINT)
@@ -136,15 +129,6 @@ def _matched_points(
                 if pair not in seen:
                     seen.add(pair)
                     yield pair
-
-
-def _is_apart(a: Ints, b: Ints, matches: int, min_shared: int) -> bool:
-    return matches >= min_shared and 2 * _shared(a, b) < min_shared
-
-
-def _shared(a: Ints, b: Ints) -> int:
-    """How many points both images see."""
-    return len(np.intersect1d(a[a != NO_POINT], b[b != NO_POINT]))
 
 
 def _current(merged: dict[int, int], point_id: int) -> int:

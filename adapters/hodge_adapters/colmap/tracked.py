@@ -32,7 +32,7 @@ from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import Model
 from hodge_adapters.colmap.resection import resected
 from hodge_adapters.colmap.scale import seen_depths
-from hodge_adapters.colmap.ties import held_apart, merge_matched_points
+from hodge_adapters.colmap.ties import apart_matches, merge_matched_points
 from hodge_adapters.colmap.uncertainty import standard_errors
 from hodge_pipeline import se3
 from hodge_pipeline.stages import Adjusted
@@ -125,7 +125,8 @@ class ColmapModel:
     @cached_property
     def bodies(self) -> Bodies:
         """The bodies, and which of them carries each image."""
-        return bodies_of(self.reconstruction, [image.image_id for image in self.records.images])
+        images = (self.tracks or self.records).images
+        return bodies_of(self.reconstruction, [image.image_id for image in images])
 
     @cached_property
     def frames(self) -> Sequence[Frame]:
@@ -158,17 +159,16 @@ class ColmapModel:
     def quality(self) -> ModelQuality:
         """Errors are computed anew: what a file says of them may be older than its poses."""
         records = self.records
-        keypoints, errors_px = reprojection_errors(records)
         owners = records.points.owners
         return ModelQuality(
             images=self.reconstruction.num_reg_images(),
             points=self.reconstruction.num_points3D(),
             mean_track_length=float(self.reconstruction.compute_mean_track_length()),
             image_names=tuple(image.name for image in records.images),
-            keypoints=keypoints,
-            errors_px=errors_px,
+            keypoints=records.keypoints,
+            errors_px=reprojection_errors(records),
             parallaxes_deg=parallaxes(records)[owners],
-            track_lengths=np.diff(records.points.offsets)[owners],
+            track_lengths=records.track_lengths,
             point_rows=owners,
         )
 
@@ -207,7 +207,7 @@ class ColmapModel:
     def held_apart(self) -> int:
         """Pairs of images that the database matches well and that share hardly a point."""
         database = self.edges.database
-        return 0 if database is None else held_apart(self.reconstruction, database, self.edges.min_shared)
+        return 0 if database is None else sum(1 for _ in apart_matches(self.records, database, self.edges.min_shared))
 
     def resected(self, bodies: Bools | None = None) -> Floats:
         """Poses (B, 4, 4): those of these bodies (B,), all by default, by the points; see `resection`."""
@@ -234,9 +234,9 @@ class ColmapModel:
 
     def scaled(self, factor: float, motion: Floats | None = None) -> ColmapModel:
         """Positions times the factor, then the whole moved by `motion` (4, 4)."""
-        copy, moved = self._copy(), np.eye(4) if motion is None else motion
+        before, copy, moved = self.records, self._copy(), np.eye(4) if motion is None else motion
         copy.transform(pycolmap.Sim3d(factor, pycolmap.Rotation3d(moved[:3, :3]), moved[:3, 3]))
-        return replace(self, reconstruction=copy, files=(), tracks=self.records)
+        return self._with(copy, refreshed(before, copy, se3.transform(moved, factor * before.points.xyz)))
 
     def moved(self, world_from_body: Floats) -> ColmapModel:
         """Bodies at these poses, points where their rays meet; what the database matched is merged where it fits."""
@@ -244,10 +244,11 @@ class ColmapModel:
         for frame_id, pose in zip(self.bodies.frame_ids, world_from_body, strict=True):
             copy.frames[frame_id].rig_from_world = pycolmap.Rigid3d(np.ascontiguousarray(se3.inverse(pose)[:3]))
         poses = world_from_body[self.bodies.body_of_image] @ self.bodies.body_from_cam
-        for point_id, xyz in zip(before.points.ids.tolist(), points_of_rays(before, poses), strict=True):
-            copy.points3D[point_id].xyz = xyz
+        points, xyz = copy.points3D, points_of_rays(before, poses)
+        for point_id, place in zip(before.points.ids.tolist(), xyz, strict=True):
+            points[point_id].xyz = place
         update_errors(copy)
-        return replace(self, reconstruction=copy, files=(), tracks=before)
+        return self._with(copy, refreshed(before, copy, xyz))
 
     def thinned(self, most_seen: int) -> ColmapModel:
         """A random part of the tracks, of which each image sees so many, or all of its own; this very model where no
@@ -260,7 +261,7 @@ class ColmapModel:
         copy = self._copy()
         for point_id in records.points.ids[~kept].tolist():
             copy.delete_point3D(point_id)
-        return replace(self, reconstruction=copy, files=(), tracks=with_points(records, kept))
+        return self._with(copy, with_points(records, kept))
 
     def merged(self) -> ColmapModel:
         """What the database matched is one point where one position fits; this very model where nothing is merged."""
@@ -268,7 +269,7 @@ class ColmapModel:
             return self
         assert self.edges.database is not None
         copy = self._copy()
-        count = merge_matched_points(copy, self.edges.database, self.edges.min_shared)
+        count = merge_matched_points(copy, self.records, self.edges.database, self.edges.min_shared)
         if not count:
             return self
         update_errors(copy)
@@ -355,7 +356,7 @@ class ColmapModel:
         if adjusts != "nothing":
             everything = adjusts == "all"  # an adjusted model is near its optimum without a part of the entries
             adjust(copy, [], self.bodies, None, move_bodies=everything, robust=self.robust, near_optimum=everything)
-        return reprojection_errors(refreshed(records, copy))[1][held]
+        return reprojection_errors(refreshed(records, copy))[held]
 
     def write(self, folder: Path) -> None:
         """Five files, binary or text as the model was."""
@@ -404,6 +405,12 @@ class ColmapModel:
             return ()
         told = f"cameras turned in their rigs by up to {max(turns):.2g}°"
         return (f"{told} and moved by up to {max(shifts) / max([*distances, 1e-300]):.0%} of the rig",)
+
+    def _with(self, reconstruction: pycolmap.Reconstruction, records: Model) -> ColmapModel:
+        """The same model of another reconstruction, whose content is known: pycolmap gives it point by point."""
+        out = replace(self, reconstruction=reconstruction, files=(), tracks=records)
+        vars(out)["records"] = records
+        return out
 
     def _copy(self) -> pycolmap.Reconstruction:
         return pycolmap.Reconstruction(self.reconstruction)
