@@ -10,6 +10,7 @@ import pycolmap
 import pytest
 
 import hodge_pipeline
+from hodge_adapters.colmap import uncertainty
 from hodge_adapters.colmap.models import ColmapModels
 from hodge_adapters.colmap.uncertainty import standard_errors
 from hodge_pipeline import se3
@@ -173,6 +174,14 @@ def test_a_body_that_sees_nothing_does_not_make_the_others_uncertain(tmp_path: P
     unseen = np.array(models[1].bodies.frame_ids) == frame_id
     assert np.isnan(unsure[unseen]).all()
     assert (unsure[~unseen] < 1.5 * sure[~unseen]).all()
+
+
+def test_each_of_many_bodies_is_taken_given_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (model,) = ColmapModels(database="none", images="none").open_models(noisy(tmp_path))
+    jointly = standard_errors(model.records, model.bodies)
+    monkeypatch.setattr(uncertainty, "MOST_BODIES_JOINTLY", 0)
+    alone = standard_errors(model.records, model.bodies)
+    assert (alone < 2 * jointly).all() and (alone > 0.5 * jointly).all()
 
 
 def test_no_number_of_a_refinement_is_that_of_a_point_behind_a_camera(tmp_path: Path) -> None:

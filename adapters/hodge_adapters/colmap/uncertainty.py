@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy.sparse import csr_array
 
 from hodge_adapters.colmap.bodies import Bodies
 from hodge_adapters.colmap.cameras import colmap_camera
-from hodge_adapters.colmap.points import error_cap
+from hodge_adapters.colmap.points import error_cap, reprojection_errors
 from hodge_adapters.colmap.records import Model
 from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -27,19 +28,13 @@ LEAST_SEEN = 3
 
 @dataclass(frozen=True)
 class _Rows:
-    """Residuals (M, 2), their derivatives by the body's ξ (M, 2, 6) and the point (M, 2, 3), and whose they are."""
+    """Of the observations of one image: derivatives of the residual by the body's ξ (M, 2, 6) and by the point
+    (M, 2, 3), and the rows (M,) of the points.
+    """
 
-    residual: Floats
     by_body: Floats
     by_point: Floats
-    body: Ints
     point: Ints
-
-    def of(self, seen: Bools) -> _Rows:
-        """The rows of these bodies (B,), which are then numbered without the others."""
-        at = seen[self.body]
-        body = (np.cumsum(seen) - 1)[self.body[at]]
-        return _Rows(self.residual[at], self.by_body[at], self.by_point[at], body, self.point[at])
 
 
 def standard_errors(model: Model, bodies: Bodies) -> Floats:
@@ -49,16 +44,17 @@ def standard_errors(model: Model, bodies: Bodies) -> Floats:
     whole stay where they are. NaN without tracks, and of a body with fewer than `LEAST_SEEN` observations, which takes
     no part: what is free beside the gauge would be mistaken for it.
     """
-    rows = _rows(model, bodies)
+    errors_px, body = reprojection_errors(model), bodies.body_of_image[model.image_rows]
+    right = errors_px <= error_cap(errors_px)
     out = np.full((len(bodies.frame_ids), 2), np.nan)
-    seen = np.bincount(rows.body, minlength=len(out)) >= LEAST_SEEN
-    rows, count = rows.of(seen), int(seen.sum())
-    points = np.unique(rows.point)
-    freedom = rows.residual.size - 6 * count - 3 * len(points) + GAUGE
-    if freedom <= 0 or not len(points):
+    seen = np.bincount(body[right], minlength=len(out)) >= LEAST_SEEN
+    used, count = right & seen[body], int(seen.sum())
+    points = np.count_nonzero(np.bincount(model.points.owners[used]))
+    freedom = 2 * int(used.sum()) - 6 * count - 3 * points + GAUGE
+    if freedom <= 0 or not points:
         return out
-    variance = float((rows.residual**2).sum()) / freedom
-    schur = _schur(rows, count, joint=count <= MOST_BODIES_JOINTLY)
+    variance = float((errors_px[used] ** 2).sum()) / freedom
+    schur = _schur(model, bodies, used, np.cumsum(seen) - 1, count)
     if count <= MOST_BODIES_JOINTLY:
         blocks = _inverse_without_gauge(schur).reshape(count, 6, count, 6)[np.arange(count), :, np.arange(count)]
     else:
@@ -68,30 +64,49 @@ def standard_errors(model: Model, bodies: Bodies) -> Floats:
     return out
 
 
-def _schur(rows: _Rows, count: int, joint: bool) -> Floats:
-    """The normal matrix of the bodies with the points eliminated: (6 B, 6 B), or its blocks (B, 6, 6) alone."""
-    size = int(rows.point.max(initial=-1)) + 1
-    normal = np.zeros((count, 6, 6))
-    np.add.at(normal, rows.body, np.swapaxes(rows.by_body, 1, 2) @ rows.by_body)
-    of_point = np.zeros((size, 3, 3))
-    np.add.at(of_point, rows.point, np.swapaxes(rows.by_point, 1, 2) @ rows.by_point)
-    of_point += 1e-9 * np.trace(of_point, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-300 * np.eye(3)
-    root = np.linalg.cholesky(np.linalg.inv(of_point))
-    mixed = np.swapaxes(rows.by_body, 1, 2) @ rows.by_point @ root[rows.point]
-    if not joint:
-        np.add.at(normal, rows.body, -mixed @ np.swapaxes(mixed, 1, 2))
+def _schur(model: Model, bodies: Bodies, used: Bools, number_of: Ints, count: int) -> Floats:
+    """The normal matrix of the bodies with the points eliminated, from the used (T,) entries of tracks: (6 B, 6 B), or
+    its blocks (B, 6, 6) alone where there are too many. `number_of`: the row there of each body.
+
+    Derivatives are made image by image, twice: those of millions of observations take gigabytes.
+    """
+    root = _roots_of_point_covariances(model, bodies, used)
+    normal, mixed = np.zeros((count, 6, 6)), list[tuple[Floats, Ints, Ints]]()
+    for image, rows in _derivatives(model, bodies, used):
+        body = int(number_of[bodies.body_of_image[image]])
+        by_body, by_both = rows.by_body.reshape(-1, 6), np.swapaxes(rows.by_body, 1, 2) @ rows.by_point
+        by_both = by_both @ root[rows.point]
+        normal[body] += by_body.T @ by_body
+        if count <= MOST_BODIES_JOINTLY:
+            mixed.append((by_both, np.full(len(by_both), body), rows.point))
+        else:
+            columns = np.swapaxes(by_both, 0, 1).reshape(6, -1)
+            normal[body] -= columns @ columns.T
+    if count > MOST_BODIES_JOINTLY:
         return normal
     blocks = np.zeros((count, 6, count, 6))
     blocks[np.arange(count), :, np.arange(count)] = normal
     out = blocks.reshape(6 * count, 6 * count)
-    for start in range(0, size, MOST_POINTS_AT_ONCE):
-        at = np.flatnonzero((rows.point >= start) & (rows.point < start + MOST_POINTS_AT_ONCE))
-        row = np.broadcast_to((6 * rows.body[at, None] + np.arange(6))[:, :, None], (len(at), 6, 3))
-        column = np.broadcast_to((3 * (rows.point[at, None] - start) + np.arange(3))[:, None], row.shape)
+    values, body_of, point = (np.concatenate(column) for column in zip(*mixed, strict=True))
+    for start in range(0, len(root), MOST_POINTS_AT_ONCE):
+        at = np.flatnonzero((point >= start) & (point < start + MOST_POINTS_AT_ONCE))
+        row = np.broadcast_to((6 * body_of[at, None] + np.arange(6))[:, :, None], (len(at), 6, 3))
+        column = np.broadcast_to((3 * (point[at, None] - start) + np.arange(3))[:, None], row.shape)
         shape = 6 * count, 3 * MOST_POINTS_AT_ONCE
-        part = csr_array((mixed[at].ravel(), (row.ravel(), column.ravel())), shape)
+        part = csr_array((values[at].ravel(), (row.ravel(), column.ravel())), shape)
         out -= (part @ part.T).toarray()
     return out
+
+
+def _roots_of_point_covariances(model: Model, bodies: Bodies, used: Bools) -> Floats:
+    """L (P, 3, 3) with L Lᵀ the inverse of each point's normal matrix."""
+    normal = np.zeros(9 * len(model.points.ids))
+    for _, rows in _derivatives(model, bodies, used):
+        products = np.swapaxes(rows.by_point, 1, 2) @ rows.by_point
+        np.add.at(normal, (9 * rows.point[:, None] + np.arange(9)).ravel(), products.ravel())
+    of_point = normal.reshape(-1, 3, 3)
+    of_point += 1e-9 * np.trace(of_point, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-300 * np.eye(3)
+    return np.asarray(np.linalg.cholesky(np.linalg.inv(of_point)))
 
 
 def _inverse_without_gauge(matrix: Floats) -> Floats:
@@ -102,39 +117,26 @@ def _inverse_without_gauge(matrix: Floats) -> Floats:
     return np.asarray((vectors[:, kept] / values[kept]) @ vectors[:, kept].T)
 
 
-def _rows(model: Model, bodies: Bodies) -> _Rows:
-    points = model.points
-    owner = points.owners
-    parts = []
-    for number, (image, here) in enumerate(zip(model.images, model.entries, strict=True)):
+def _derivatives(model: Model, bodies: Bodies, used: Bools) -> Iterator[tuple[int, _Rows]]:
+    """Each image's row with the derivatives at its used (T,) entries of tracks."""
+    points, owner = model.points, model.points.owners
+    for number, (image, entries) in enumerate(zip(model.images, model.entries, strict=True)):
+        here = entries[used[entries]]
+        if not len(here):
+            continue
         camera = colmap_camera(model.cameras[image.camera_id])
-        body = bodies.body_of_image[number]
-        body_from_world, cam_from_body = (
-            se3.inverse(bodies.world_from_body[body]),
-            se3.inverse(bodies.body_from_cam[number]),
-        )
+        body_from_world = se3.inverse(bodies.world_from_body[bodies.body_of_image[number]])
+        cam_from_body = se3.inverse(bodies.body_from_cam[number])
         in_body = se3.transform(body_from_world, points.xyz[owner[here]])
         in_cam = se3.transform(cam_from_body, in_body)
-
-        def project(xyz: Floats, camera: object = camera) -> Floats:
-            return np.asarray(camera.img_from_cam(xyz))  # type: ignore[attr-defined]
-
         step = STEP * np.maximum(np.abs(in_cam[:, 2:]), 1e-12)
-        slopes = [(project(in_cam + step * axis) - project(in_cam - step * axis)) / (2 * step) for axis in np.eye(3)]
+        ends = [
+            [np.asarray(camera.img_from_cam(in_cam + sign * step * axis)) for sign in (1, -1)] for axis in np.eye(3)
+        ]
+        slopes = [(ahead - behind) / (2 * step) for ahead, behind in ends]
         by_body_point = np.stack(slopes, axis=2) @ cam_from_body[:3, :3]
         # a body at T exp(ξ) sees the point at x − φ × x − ρ
         motion = np.concatenate([se3.hat(in_body), np.broadcast_to(-np.eye(3), (len(here), 3, 3))], axis=2)
-        residual = project(in_cam) - image.pixels[points.columns[here]]
-        good = np.isfinite(residual).all(axis=1) & np.isfinite(by_body_point).all(axis=(1, 2))
-        rows = (
-            residual,
-            by_body_point @ motion,
-            by_body_point @ body_from_world[:3, :3],
-            np.full(len(here), body),
-            owner[here],
-        )
-        parts.append([column[good] for column in rows])
-    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    errors_px = np.linalg.norm(columns[0], axis=1)
-    right = errors_px <= error_cap(errors_px)
-    return _Rows(*(column[right] for column in columns))
+        good = np.isfinite(by_body_point).all(axis=(1, 2))
+        by_point = by_body_point @ body_from_world[:3, :3]
+        yield number, _Rows((by_body_point @ motion)[good], by_point[good], owner[here][good])
