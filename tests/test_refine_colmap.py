@@ -23,8 +23,11 @@ from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import SourceError, WorkspaceError
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.pairs.edits import listed_edges
+from hodge_pipeline.refine import choice
+from hodge_pipeline.refine.candidates import ADJUSTED, GIVEN, POINTS
 from hodge_pipeline.refine.frame import in_frame_of
 from hodge_pipeline.refine.scale import metric_scale
+from hodge_pipeline.stages import Step
 from hodge_pipeline.types import Floats
 from test_readers_colmap import synthetic
 
@@ -96,6 +99,7 @@ def test_disturbed_poses_come_back_with_every_rig_name_and_track(tmp_path: Path,
     given = "auto" if database else "none"
     done = hodge_pipeline.refine_colmap(start, database=given, out=tmp_path / "out", overrides=FREE)
     assert done.exit_code == 0 and done.results[0].decision.outcome == "refined"
+    assert [name for name, _ in done.results[0].candidates][:3] == [GIVEN, POINTS, ADJUSTED]
     before, after = pycolmap.Reconstruction(model), pycolmap.Reconstruction(tmp_path / "out/sparse/0")
     assert error_px(start) > 3 and error_px(tmp_path / "out/sparse/0") <= 1.001 * error_px(model)
     assert tracks(after) == tracks(before)
@@ -229,10 +233,35 @@ def test_an_optimal_model_is_given_back_byte_for_byte(tmp_path: Path) -> None:
     done = hodge_pipeline.refine_colmap(model, out=tmp_path / "out", overrides=FREE)
     decision = done.results[0].decision
     assert decision.outcome == "optimal"
+    assert [name for name, _ in done.results[0].candidates] == [GIVEN, ADJUSTED], "points alone can gain nothing"
     names = sorted(path.name for path in model.iterdir())
     assert names == sorted(path.name for path in (tmp_path / "out/sparse/0").iterdir())
     for name in names:
         assert (tmp_path / "out/sparse/0" / name).read_bytes() == (model / name).read_bytes()
+
+
+def test_an_adjustment_of_points_leaves_poses_and_rigs_bit_for_bit(tmp_path: Path) -> None:
+    (model,) = ColmapModels().open_models(disturbed(noisy(tmp_path), tmp_path / "start"))
+    adjusted = model.adjusted(move_bodies=False)
+    before, after = model.reconstruction, adjusted.reconstruction
+    assert not np.array_equal(adjusted.records.points.xyz, model.records.points.xyz)
+    np.testing.assert_array_equal(adjusted.world_from_body, model.world_from_body)
+    sensors = [(key, sensor) for key, rig in before.rigs.items() for sensor in rig.non_ref_sensors]
+    assert sensors
+    for key, sensor in sensors:
+        places = (one.rigs[key].non_ref_sensors[sensor].matrix() for one in (before, after))
+        np.testing.assert_array_equal(*places)
+
+
+def test_observations_are_held_out_of_a_sample_of_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (model,) = ColmapModels().open_models(noisy(tmp_path))
+    step = Step(tmp_path, Mock(), Mock())
+    whole = choice.held_out_errors(model, model, False, 0, step=step).errors_px
+    monkeypatch.setattr(choice, "ENOUGH_SEEN", 20)
+    part = choice.held_out_errors(model, model, False, 0, step=step).errors_px
+    most = 20 * model.quality.images * choice.OBSERVATIONS_HELD_OUT
+    assert 0 < part.shape[1] < 1.5 * most < whole.shape[1]
+    assert np.median(part[0]) == pytest.approx(np.median(whole[0]), rel=0.5)
 
 
 def test_a_reconstruction_goes_in_and_comes_out_and_nothing_is_computed_twice(

@@ -103,6 +103,17 @@ class _Candidates:
         same = [row for row in rows if self.costs[row].px <= (1 + SAME_COST) * lowest.px]
         return lowest.is_sound or (len(same) > 1 and not lowest.images_off)
 
+    @property
+    def is_at_optimum(self) -> bool:
+        """Whether the input is sound and an adjustment of all leaves it as good: one of points alone gains nothing.
+
+        Known positions draw an adjustment away from the optimum of the tracks.
+        """
+        if len(self.costs) < 2 or self._known is not None:
+            return False
+        given, adjusted = self.costs[0], self.costs[-1]
+        return given.is_sound and abs(adjusted.px - given.px) <= SAME_COST * given.px
+
     def add(
         self,
         name: str,
@@ -112,9 +123,10 @@ class _Candidates:
         *,
         move_bodies: bool = True,
         near_optimum: bool = False,
+        row: int | None = None,
     ) -> None:
         """Adjust a model, as a step, from its own poses or from these (B, 4, 4), or its points alone; a failure is a
-        note.
+        note. It becomes the candidate of this row, by default the last.
         """
         start = model, poses, priors or self._known
         try:
@@ -126,7 +138,8 @@ class _Candidates:
         if move_bodies and self._known is None:
             adjusted = in_frame_of(self._start, adjusted)
         self._steps.remember(adjusted, self._steps.key(found))
-        self.candidates.append(CandidateModel(name, adjusted, holds_poses=not move_bodies))
+        at = len(self.candidates) if row is None else row
+        self.candidates.insert(at, CandidateModel(name, adjusted, holds_poses=not move_bodies))
         self.update_costs()
 
 
@@ -143,8 +156,9 @@ def make_candidates(
     Depth takes part only where the model is in metres: without a scale its clouds do not fit the model's unit.
     """
     found, model, first_robust = _Candidates(inputs, start, steps), start, 0
-    found.add(POINTS, start, move_bodies=False)
     found.add(ADJUSTED, start)
+    if not found.is_at_optimum:
+        found.add(POINTS, start, move_bodies=False, row=1)
     if not found.costs[0].is_sound:
         poses = steps.step(resected_poses, start, None, title="resection").poses
         # where the best is sound this only tells whether it is the optimum

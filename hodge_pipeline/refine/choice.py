@@ -12,7 +12,7 @@ from hodge_pipeline.evaluation.scores import SIGMA_M
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.refine.candidates import CandidateSet
 from hodge_pipeline.refine.guard import SCORE_TOLERANCE, Measure
-from hodge_pipeline.refine.reprojection_cost import best, degrees_of_freedom, mends
+from hodge_pipeline.refine.reprojection_cost import ENOUGH_SEEN, best, degrees_of_freedom, mends
 from hodge_pipeline.refine.uncertainty import told_apart
 from hodge_pipeline.stages import Adjusted, Step, Steps, TrackedModel
 from hodge_pipeline.types import Floats
@@ -194,11 +194,13 @@ class HeldOutErrors:
 def held_out_errors(start: TrackedModel, model: TrackedModel, moves: bool, seed: int, *, step: Step) -> HeldOutErrors:
     """Step: errors at random observations that were left out of the adjustment: where the candidate `moves` poses, of
     the start of its points alone and of the candidate of points and poses; else of the start as it is and of the
-    candidate of its points. None where merged tracks make the observations incomparable.
+    candidate of its points. Of tracks of which each image sees `ENOUGH_SEEN`. None where merged tracks make the
+    observations incomparable.
     """
     adjusted: tuple[Adjusted, Adjusted] = ("points", "all") if moves else ("nothing", "points")
     out = []
-    for one, what in zip((start, model), adjusted, strict=True):
+    for whole, what in zip((start, model), adjusted, strict=True):
+        one = whole.thinned(ENOUGH_SEEN)
         chosen = np.random.default_rng(seed).random(len(one.quality.errors_px)) < OBSERVATIONS_HELD_OUT
         out.append(one.held_out_errors(chosen, what))
     if len(out[0]) != len(out[1]):

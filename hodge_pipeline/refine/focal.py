@@ -7,7 +7,7 @@ from typing import Literal
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.difference import alike
 from hodge_pipeline.refine.candidates import CandidateSet, adjusted_model
-from hodge_pipeline.refine.reprojection_cost import costs, degrees_of_freedom
+from hodge_pipeline.refine.reprojection_cost import ENOUGH_SEEN, costs, degrees_of_freedom
 from hodge_pipeline.stages import Steps, TrackedModel
 
 FREE: dict[Literal["rig", "focal", "all"], tuple[str, str, float]] = {
@@ -20,8 +20,6 @@ length that is 3 % off causes 15 % in lund_door and 43 % in a rendered room; mod
 Principal points, which COLMAP holds, gain a few per cent in any model. What comes later must save that beyond the best
 before it.
 """
-ENOUGH_SEEN = 500
-"""Observations of an image: on so many the gain is told to 1 %, since a pose fits six of the thousand numbers anew."""
 LEAST_FREEDOM = 10
 """Degrees of freedom to an image: with fewer any further parameter fits better."""
 

@@ -32,6 +32,8 @@ BY_CHANCE = 1e-4
 """Probability of as many mended observations among all that change sides, were each as likely mended as spoilt."""
 SOUND_SHARE = 0.05
 """Share of the observations beyond the cap: sound models have as many wrong ones."""
+ENOUGH_SEEN = 500
+"""Observations of an image: on so many a gain is told to 1 %, since a pose fits six of the thousand numbers anew."""
 _COLUMNS = ("errors_px", "parallaxes_deg", "track_lengths")
 
 
@@ -93,7 +95,15 @@ def costs(inputs: Sequence[ModelQuality], candidates: Sequence[ModelQuality]) ->
     given = [np.concatenate([getattr(one, name) for one in inputs])[first] for name in _COLUMNS]
     shared = given[2] > 1
     keys, (*values, track_lengths) = keys[shared], (column[shared] for column in given)
-    found = [values, *(_values(one, number, keys) for one in candidates)]
+    # models of the same tracks have one array of keypoints
+    found, places = [values], dict[tuple[int, tuple[str, ...]], tuple[Ints, Ints]]()
+    if len(inputs) == 1:
+        places[id(inputs[0].keypoints), inputs[0].image_names] = np.arange(len(keys)), first[shared]
+    for one in candidates:
+        tracks = id(one.keypoints), one.image_names
+        if tracks not in places:
+            places[tracks] = np.intersect1d(keys, _keys(one, number), return_indices=True)[1:]
+        found.append(_values(one, len(keys), *places[tracks]))
     errors_px, parallaxes_deg = (np.array(column) for column in zip(*found, strict=True))
     weights = 1.0 - POINT_PARAMETERS / (2.0 * track_lengths)
     distant = ~(parallaxes_deg >= LEAST_PARALLAX_DEG)
@@ -184,10 +194,8 @@ def _keys(quality: ModelQuality, number: dict[str, int]) -> Ints:
     return np.asarray(np.where(image < 0, -1, (image << 32) + quality.keypoints[:, 1]), np.int64)
 
 
-def _values(quality: ModelQuality, number: dict[str, int], keys: Ints) -> tuple[Floats, Floats]:
-    """Errors and parallaxes (N,) at the observations of these keys; infinite and 0 where the candidate lost one."""
-    own = _keys(quality, number)
-    _, rows, own_rows = np.intersect1d(keys, own, return_indices=True)
-    errors_px, parallaxes_deg = np.full(len(keys), np.inf), np.zeros(len(keys))
+def _values(quality: ModelQuality, count: int, rows: Ints, own_rows: Ints) -> list[Floats]:
+    """Errors and parallaxes (count,) at these rows, from the candidate's own; infinite and 0 where it lost one."""
+    errors_px, parallaxes_deg = np.full(count, np.inf), np.zeros(count)
     errors_px[rows], parallaxes_deg[rows] = quality.errors_px[own_rows], quality.parallaxes_deg[own_rows]
-    return errors_px, parallaxes_deg
+    return [errors_px, parallaxes_deg]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from typing import Literal, TypeAlias
 
@@ -21,6 +22,9 @@ ROUGH = 1e-3
 CONVERGED = 1e-12
 """Relative change of the cost at which others end: of a million residuals it is a millionth of what one contributes.
 COLMAP goes on until the gradient vanishes, among rounding errors for up to half of its steps."""
+POINTS_CONVERGED = 1e-6
+"""The same where points alone move: none pulls another, so no long valley is left to go along where the cost falls as
+slowly, and it is a hundredth of what tells two costs apart."""
 WIDE = 1e8
 """Radius of the first trust region near an optimum: what COLMAP's own 1e4 grows to in eight good steps."""
 
@@ -45,8 +49,11 @@ def adjust(
     `roughly`: to a step that gains less than `ROUGH` of the cost. `near_optimum`: with whole Gauss-Newton steps from
     the first, of which few suffice there. Raises `SourceError` where the adjustment fails.
     """
-    part = pycolmap.Reconstruction(reconstruction)
     loose = {key for key, point in reconstruction.points3D.items() if point.track.length() < 2}
+    is_whole = not loose and not behind
+    part = reconstruction if is_whole else pycolmap.Reconstruction(reconstruction)
+    poses = {frame_id: copy(reconstruction.frames[frame_id].rig_from_world) for frame_id in bodies.frame_ids}
+    rigs = _sensors_from_rigs(reconstruction)
     for key in loose:  # they tell nothing; real models have such, and COLMAP refuses to adjust a model with them
         part.delete_point3D(key)
     for image_id, column in behind:
@@ -57,7 +64,8 @@ def adjust(
     if not part.num_points3D():
         raise SourceError("no point was seen by two images: nothing ties the poses: triangulate points first")
     options = _options(refine)
-    options.ceres.solver_options.function_tolerance = ROUGH if roughly else CONVERGED
+    converged = CONVERGED if move_bodies else POINTS_CONVERGED
+    options.ceres.solver_options.function_tolerance = ROUGH if roughly else converged
     if near_optimum:
         options.ceres.solver_options.initial_trust_region_radius = WIDE
     # far from the origin (UTM) and in large units it would stop early: its tolerances are absolute
@@ -66,19 +74,30 @@ def adjust(
         priors = replace(priors, positions=priors.positions + normal_from_world.translation)
     _solve(_adjuster(part, bodies, priors, move_bodies, options, robust))
     part.transform(normal_from_world.inverse())
-    if move_bodies:
-        for frame_id in bodies.frame_ids:
-            reconstruction.frames[frame_id].rig_from_world = part.frames[frame_id].rig_from_world
-    for camera_id, camera in part.cameras.items():
-        reconstruction.cameras[camera_id].params = camera.params
-    if refine == "rig":
-        for rig_id, rig in part.rigs.items():
-            for sensor, sensor_from_rig in rig.non_ref_sensors.items():
-                if sensor_from_rig is not None:
-                    reconstruction.rigs[rig_id].set_sensor_from_rig(sensor, sensor_from_rig)
-    for key, point in part.points3D.items():
-        reconstruction.points3D[key].xyz = point.xyz
+    # what was held is bit for bit what it was
+    for frame_id, pose in poses.items():
+        reconstruction.frames[frame_id].rig_from_world = part.frames[frame_id].rig_from_world if move_bodies else pose
+    for (rig_id, sensor), pose in (_sensors_from_rigs(part) if refine == "rig" else rigs).items():
+        reconstruction.rigs[rig_id].set_sensor_from_rig(sensor, pose)
+    if not is_whole:
+        for camera_id, camera in part.cameras.items():
+            reconstruction.cameras[camera_id].params = camera.params
+        points = reconstruction.points3D
+        for key, point in part.points3D.items():
+            points[key].xyz = point.xyz
     return loose
+
+
+def _sensors_from_rigs(
+    reconstruction: pycolmap.Reconstruction,
+) -> dict[tuple[int, pycolmap.sensor_t], pycolmap.Rigid3d]:
+    """Copies of where each rig holds its other sensors, as far as that is known."""
+    return {
+        (rig_id, sensor): copy(sensor_from_rig)
+        for rig_id, rig in reconstruction.rigs.items()
+        for sensor, sensor_from_rig in rig.non_ref_sensors.items()
+        if sensor_from_rig is not None
+    }
 
 
 def _adjuster(
