@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -176,12 +177,19 @@ def test_a_body_that_sees_nothing_does_not_make_the_others_uncertain(tmp_path: P
     assert (unsure[~unseen] < 1.5 * sure[~unseen]).all()
 
 
-def test_each_of_many_bodies_is_taken_given_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_of_many_bodies_are_those_of_their_joint_normal_matrix(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (model,) = ColmapModels(database="none", images="none").open_models(noisy(tmp_path))
-    jointly = standard_errors(model.records, model.bodies)
+    poses = np.array([image.world_from_cam for image in model.records.images])
+    count = len(poses)
+    each = np.arange(count)
+    alone = np.tile(np.eye(4), (count, 1, 1))
+    bodies = replace(model.bodies, world_from_body=poses, body_of_image=each, body_from_cam=alone)
+    given = model.records, bodies, np.ones(len(model.quality.errors_px), bool), each, count
+    jointly = uncertainty._schur(*given).reshape(count, 6, count, 6)[each, :, each]
     monkeypatch.setattr(uncertainty, "MOST_BODIES_JOINTLY", 0)
-    alone = standard_errors(model.records, model.bodies)
-    assert (alone < 2 * jointly).all() and (alone > 0.5 * jointly).all()
+    np.testing.assert_allclose(uncertainty._schur(*given), jointly, rtol=1e-6, atol=1e-6 * jointly.max())
 
 
 def test_no_number_of_a_refinement_is_that_of_a_point_behind_a_camera(tmp_path: Path) -> None:
