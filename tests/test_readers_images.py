@@ -196,6 +196,13 @@ def test_what_cannot_be_inflated_is_left_to_opencv(tmp_path: Path, monkeypatch: 
     np.testing.assert_array_equal(pixels.read_depth(path, units_per_metre=1000.0), expected)
 
 
+def test_resampled_colour_lies_between_its_pixels_and_is_black_outside() -> None:
+    image = np.array([[[0, 40, 200], [100, 80, 100]]], np.uint8)
+    columns, rows = np.array([[0, 0.5, 1, 5]], np.float32), np.zeros((1, 4), np.float32)
+    found = pixels.resampled_colour(image, columns, rows)
+    np.testing.assert_array_equal(found, [[[0, 40, 200], [50, 60, 150], [100, 80, 100], [0, 0, 0]]])
+
+
 def test_bytes_behind_a_png_are_left_to_opencv() -> None:
     """A chunk of two bytes behind the last one ended the run with the parser's own error."""
     whole = png.encoded_depth(np.arange(12, dtype=np.uint16).reshape(3, 4))

@@ -98,5 +98,4 @@ def read_undistorted_colour(path: Path, *, record: CameraRecord, size: tuple[int
         return np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)
     if (width, height) != size:
         colour = np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)
-    columns, rows = undistortion(record, size)
-    return np.asarray(cv2.remap(colour, columns, rows, cv2.INTER_LINEAR, borderValue=(0, 0, 0)), np.uint8)
+    return pixels.resampled_colour(colour, *undistortion(record, size))

@@ -110,8 +110,7 @@ def undistorted_depth(read: Callable[[], Floats32], lens: Lens) -> Floats32:
 
 def undistorted_colour(read: Callable[[], Bytes], lens: Lens) -> Bytes:
     """The colour image, undistorted; black beyond the edge of the original."""
-    columns, rows = _maps(lens)
-    return np.asarray(cv2.remap(read(), columns, rows, cv2.INTER_LINEAR), np.uint8)
+    return pixels.resampled_colour(read(), *_maps(lens))
 
 
 def encoded_undistorted_depth(read: Callable[[], Floats32], lens: Lens, units_per_metre: float) -> EncodedImage:

@@ -63,6 +63,15 @@ def read_colour(path: Path, *, size: tuple[int, int] | None = None) -> Bytes:
     return np.asarray(stored, np.uint8)
 
 
+def resampled_colour(image: Bytes, columns: Floats32, rows: Floats32) -> Bytes:
+    """The colour (H, W, 3) at these columns and rows (H, W) of an image, linearly interpolated, black outside it.
+
+    OpenCV interpolates four channels in half the time of three, to the same values.
+    """
+    four = cv2.cvtColor(image, cv2.COLOR_RGB2RGBA)
+    return np.asarray(cv2.cvtColor(cv2.remap(four, columns, rows, cv2.INTER_LINEAR), cv2.COLOR_RGBA2RGB), np.uint8)
+
+
 def _decoded(path: Path, size: tuple[int, int] | None, how: int, any_scale: bool = False) -> Any:
     stored = decoded(read_whole_image(path, size, any_scale), how)
     if stored is None:

@@ -15,6 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hodge_pipeline.types import Bytes
+
 isal_zlib: Any = None
 with suppress(ImportError):  # there are no wheels for every machine
     isal_zlib = import_module("isal.isal_zlib")
@@ -71,8 +73,20 @@ def _unfiltered(before: bytes, raw: bytes, after: bytes, how: int) -> Any:
     rows = np.frombuffer(raw, np.uint8).reshape(height, -1)
     if (rows[:, 0] != _SUB).any():
         return None
-    sums = np.add.accumulate(rows[:, 1:].reshape(height, width, pixel), axis=1, dtype=np.uint8)
+    sums = _sums(rows[:, 1:], pixel).reshape(height, width, pixel)
     return sums if pixel == 3 else sums.view(">u2")[..., 0].astype(np.uint16)
+
+
+def _sums(differences: Bytes, pixel: int) -> Bytes:
+    """The running sums, modulo 256, of each row of pixels of so many bytes: of the last 2, 4, 8, … of them, in half the
+    time of `np.add.accumulate`, which adds one byte at a time.
+    """
+    sums = differences.copy()
+    step = pixel
+    while step < sums.shape[1]:
+        sums[:, step:] += sums[:, :-step]  # of what was there before: numpy copies where the two overlap
+        step *= 2
+    return sums
 
 
 def _with_stored(before: bytes, raw: bytes, after: bytes) -> bytes:

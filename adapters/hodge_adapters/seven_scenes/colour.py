@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from hodge_adapters.images import pixels
@@ -120,7 +119,7 @@ def read_registered_colour(path: Path, depth: DepthFile) -> Bytes:
     """
     image = pixels.read_colour(path, size=depth.size)
     seen = colour_pixels(_read_last(depth, _changed(depth.path)), depth.camera)
-    return np.asarray(cv2.remap(image, *seen, cv2.INTER_LINEAR, borderValue=(0, 0, 0)), np.uint8)
+    return pixels.resampled_colour(image, *seen)
 
 
 def encoded_registered_colour(path: Path, depth: DepthFile) -> EncodedImage:
