@@ -293,6 +293,32 @@ def test_the_rectified_image_has_the_projection_of_p(tmp_path: Path) -> None:
         assert any("lens distortion" in note for note in source.notes) == ("raw" in topic)
 
 
+@pytest.mark.parametrize(("model", "more"), [("plumb_bob", []), ("rational_polynomial", [0.1, 0.05, 0.0])])
+def test_what_the_lens_bent_is_straight(tmp_path: Path, model: str, more: list[float]) -> None:
+    camera, d = Camera(128, 96, 50, 50, 63.5, 47.5), [-0.2, 0.05, 0.005, -0.005, 0.0, *more]
+    ray = np.array([[[-0.9, -0.7, 1.0]]])
+    u, v = np.round(cv2.projectPoints(ray, np.zeros(3), np.zeros(3), camera.matrix, np.array(d))[0].ravel()).astype(int)
+    meant = (camera.matrix @ ray.ravel())[:2]
+    assert np.hypot(u - meant[0], v - meant[1]) > 5
+    seen = np.zeros((96, 128), np.uint16)
+    seen[v - 1 : v + 2, u - 1 : u + 2] = 2000
+    bright = np.where(seen[..., None], 255, 0).repeat(3, axis=2).astype(np.uint8)
+    head, log = foxglove_header(100, OPTICAL), Log()
+    log.add(DEPTH, COMPRESSED, {**head, **compressed_depth(seen, "png")}, CDR)
+    log.add(COLOUR, RAW, {**head, **raw_image(bright, "rgb8")}, CDR)
+    info = {**calibration(128, 96, 50, 50, 63.5, 47.5), "D": d, "distortion_model": model}
+    log.add(INFO, CALIBRATION, {**head, **info}, CDR)
+    (frame,) = check_reader(McapReader(), log.write(tmp_path / "log.mcap")).frames
+    (bent,) = McapReader(undistort=False).open(tmp_path / "log.mcap").frames
+    assert frame.read_depth and frame.read_colour and frame.encoded_depth and bent.read_depth
+    for image in (frame.read_depth(), frame.read_colour()[..., 0] > 200):
+        rows, columns = np.nonzero(image)
+        np.testing.assert_allclose([columns.mean(), rows.mean()], meant, atol=1.0)
+    coded = cv2.imdecode(np.frombuffer(frame.encoded_depth().contents, np.uint8), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(coded, stored(frame, 1000))
+    np.testing.assert_array_equal(stored(bent, 1000), seen)
+
+
 def test_stamps_that_mean_nothing(tmp_path: Path) -> None:
     log = Log()
     for row in range(3):

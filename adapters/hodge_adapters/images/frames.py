@@ -63,16 +63,17 @@ def image_frame(
         sequence=sequence,
         colour_delay_s=colour_delay_s,
     )
-    return frame if lens is None else _undistorted(frame, lens, units_per_metre)
+    return frame if lens is None else undistorted(frame, lens, units_per_metre)
 
 
 def _image_file(path: Path, camera: Camera, lens: Lens | None) -> ImageFile:
     if lens is None:
         return image_file(path, camera)
-    return image_file(path, camera, "FULL_OPENCV", (*lens.distortion, 0.0, 0.0, 0.0))
+    return image_file(path, camera, "FULL_OPENCV", (*lens.distortion, 0.0, 0.0, 0.0)[:8])
 
 
-def _undistorted(frame: Frame, lens: Lens, units_per_metre: float) -> Frame:
+def undistorted(frame: Frame, lens: Lens, units_per_metre: float) -> Frame:
+    """The frame with its depth and colour undistorted; depth is encoded in these units."""
     depth, colour = frame.read_depth, frame.read_colour
     return replace(
         frame,
@@ -85,10 +86,12 @@ def _undistorted(frame: Frame, lens: Lens, units_per_metre: float) -> Frame:
 
 @dataclass(frozen=True)
 class Lens:
-    """The pinhole camera of the undistorted images, and the distortion `k1 k2 p1 p2 k3` (Brown's, as in OpenCV)."""
+    """The pinhole camera of the undistorted images, and the distortion `k1 k2 p1 p2 k3` (Brown's, as in OpenCV), or
+    with `k4 k5 k6` (the rational one).
+    """
 
     camera: Camera
-    distortion: tuple[float, float, float, float, float]
+    distortion: tuple[float, ...]
 
 
 @lru_cache(maxsize=4)

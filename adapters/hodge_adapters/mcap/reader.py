@@ -18,6 +18,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters.association import nearest_in_runs
 from hodge_adapters.images.camera_files import Intrinsics, checked
+from hodge_adapters.images.frames import Lens, undistorted
 from hodge_adapters.mcap.clouds import lies_far, read_points
 from hodge_adapters.mcap.files import find_files, sniff_recording
 from hodge_adapters.mcap.fixes import positions_of
@@ -56,6 +57,11 @@ class McapReader:
     calibration_topic: str = Field("", description="topic of the calibration; empty: the one beside the images")
     camera: tuple[float, float, float, float] | None = Field(
         None, description="fx fy cx cy in pixels, for recordings without a calibration"
+    )
+    undistort: bool = Field(
+        True,
+        description="undistort depth and colour by D of the calibration, of the models plumb_bob and "
+        "rational_polynomial; topics named rect are undistorted already",
     )
     depth_scale: float | None = Field(
         None,
@@ -139,11 +145,12 @@ class McapReader:
         topic = named or best_depth(depth, colour, notes)
         images = one_per_stamp(topic, depth[topic], notes)
         before = len(notes)
-        camera = self._camera(recording, topic, images[0], notes)
-        if camera is None:
+        found = self._camera(recording, topic, images[0], notes)
+        if found is None:
             reasons = [*notes[before:], *recording.complaints.counted(A_MESSAGE_WITH + NO_PINHOLE)]
             why = "".join(f"; {note}" for note in reasons)
             raise SourceError(f"{path}: no calibration for {topic}{why}: give --set source.reader.camera=[fx,fy,cx,cy]")
+        camera, lens = found
         if self.colour_topic:
             colour = dict([named_topic(colour, self.colour_topic, "colour_topic")])
         colour_topic = best_colour(colour, topic, images[0], notes)
@@ -152,17 +159,17 @@ class McapReader:
         given: dict[str, Any] = {"units_per_metre": self.depth_scale, "no_depth": self.no_depth}
         for row, (image, other) in enumerate(zip(images, coloured, strict=True)):
             is_plain_png = image.layout.coding == "png" and image.layout.quantisation is None
-            frames.append(
-                Frame(
-                    frame_id=row,
-                    stamp_s=image.stamp_s,
-                    camera=camera,
-                    read_depth=partial(read_depth, image.payload, image.layout, **given),
-                    encoded_depth=partial(encoded_image, image.payload, image.layout, units) if is_plain_png else None,
-                    read_colour=partial(read_colour, other.payload, other.layout) if other else None,
-                    encoded_colour=_encoded_colour(other),
-                )
+            frame = Frame(
+                frame_id=row,
+                stamp_s=image.stamp_s,
+                camera=camera,
+                read_depth=partial(read_depth, image.payload, image.layout, **given),
+                encoded_depth=partial(encoded_image, image.payload, image.layout, units) if is_plain_png else None,
+                read_colour=partial(read_colour, other.payload, other.layout) if other else None,
+                encoded_colour=_encoded_colour(other),
+                colour_delay_s=other.stamp_s - image.stamp_s if other else 0.0,
             )
+            frames.append(undistorted(frame, lens, units) if lens else frame)
         return frames, _coordinate_frame(topic, images, notes)
 
     def _associated(
@@ -207,7 +214,7 @@ class McapReader:
     def _colour_frames(self, recording: Recording, colour: ImageTopics, notes: list[str]) -> tuple[list[Frame], str]:
         topic = self._pick(colour, self.colour_topic, "colour_topic", notes)
         images = one_per_stamp(topic, colour[topic], notes)
-        camera = self._camera(recording, topic, images[0], notes)
+        camera = (self._camera(recording, topic, images[0], notes) or (None,))[0]
         notes.append(f"frames are the images of {topic} alone: there is neither depth nor a point cloud")
         frames = [
             Frame(
@@ -221,10 +228,12 @@ class McapReader:
         ]
         return frames, _coordinate_frame(topic, images, notes)
 
-    def _camera(self, recording: Recording, topic: str, image: Seen[ImageLayout], notes: list[str]) -> Camera | None:
+    def _camera(
+        self, recording: Recording, topic: str, image: Seen[ImageLayout], notes: list[str]
+    ) -> tuple[Camera, Lens | None] | None:
         if self.camera is not None:
-            return checked(Intrinsics(*self.camera), "option camera").camera(image.layout.size)
-        return find_camera(recording, topic, image, self.calibration_topic, notes)
+            return checked(Intrinsics(*self.camera), "option camera").camera(image.layout.size), None
+        return find_camera(recording, topic, image, self.calibration_topic, notes, undistort=self.undistort)
 
     def _pick(self, topics: Mapping[str, Sequence[object]], name: str, what: str, notes: list[str]) -> str:
         if name:

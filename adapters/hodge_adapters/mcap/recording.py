@@ -61,7 +61,7 @@ class Seen(Generic[Layout]):
 
 @dataclass(frozen=True)
 class Calibration:
-    """A pinhole calibration: K and P by rows, and whether the lens is said to distort."""
+    """A pinhole calibration: K and P by rows, and the distortion D as the model orders it."""
 
     frame_id: str
     width: int
@@ -69,7 +69,12 @@ class Calibration:
     k: tuple[float, ...]
     p: tuple[float, ...]
     model: str
-    is_distorted: bool
+    d: tuple[float, ...]
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether the lens is said to distort."""
+        return any(self.d)
 
 
 @dataclass
@@ -197,7 +202,7 @@ def _add_calibration(recording: Recording, message: Message, path: Path, logged:
         k=tuple(k.tolist()),
         p=tuple(p.tolist()) if len(p) == 12 and np.isfinite(p).all() else (),
         model=text(message, "distortion_model"),
-        is_distorted=bool(np.any(distortion != 0)),
+        d=tuple(distortion.tolist()),
     )
     if recording.calibrations.setdefault(topic, calibration) != calibration:
         recording.complaints.count(topic, "a calibration that differs from the topic's first, which all frames get")

@@ -12,6 +12,7 @@ import numpy as np
 
 from hodge_adapters.association import clock_runs
 from hodge_adapters.images.camera_files import principal_point_note, resized
+from hodge_adapters.images.frames import Lens
 from hodge_adapters.images.pixels import same_shape
 from hodge_adapters.mcap.images import ImageLayout
 from hodge_adapters.mcap.recording import Calibration, Recording, Seen
@@ -24,6 +25,8 @@ Item = TypeVar("Item")
 ImageTopics = Mapping[str, Sequence[Seen[ImageLayout]]]
 
 _TRANSPORTS = ("/compressedDepth", "/compressed", "/raw", "/zstd", "/ffmpeg", "/theora")
+_BROWN_MODELS = frozenset(("", "plumb_bob", "rational_polynomial", "brown_conrady"))
+"""Whose D is OpenCV's: four, five or, with a denominator, eight numbers."""
 _PINHOLE_MODELS = frozenset(
     (
         "", "none", "pinhole", "plumb_bob", "rational_polynomial", "brown_conrady", "modified_brown_conrady",
@@ -99,15 +102,22 @@ def best_colour(colour: ImageTopics, depth_topic: str, first: Seen[ImageLayout],
 
 
 def find_camera(
-    recording: Recording, topic: str, image: Seen[ImageLayout], calibration_topic: str, notes: list[str]
-) -> Camera | None:
-    """The camera of an image topic by its calibration; None, with notes, where none fits. One of another size is scaled
-    where the shape is the same and its topic lies beside that of the images.
+    recording: Recording,
+    topic: str,
+    image: Seen[ImageLayout],
+    calibration_topic: str,
+    notes: list[str],
+    *,
+    undistort: bool,
+) -> tuple[Camera, Lens | None] | None:
+    """The camera of an image topic by its calibration, and its lens where images are to be undistorted; None, with
+    notes, where none fits. One of another size is scaled where the shape is the same and its topic lies beside that of
+    the images.
     """
     known = recording.calibrations
     if calibration_topic:
         chosen, calibration = named_topic(known, calibration_topic, "calibration_topic")
-        return _camera(chosen, calibration, topic, image.layout, notes)
+        return _camera(chosen, calibration, topic, image.layout, undistort, notes)
     for name in sorted(known):
         if known[name].model.lower() not in _PINHOLE_MODELS:
             notes.append(f"{name}: calibration left out: its model {known[name].model!r} is no pinhole camera")
@@ -134,7 +144,7 @@ def find_camera(
         return not is_beside(name), fitting[name].frame_id != image.frame_id, -len(_common_start(name, topic)), name
 
     chosen = min(fitting, key=rank)
-    return _camera(chosen, fitting[chosen], topic, image.layout, notes)
+    return _camera(chosen, fitting[chosen], topic, image.layout, undistort, notes)
 
 
 def image_base(topic: str) -> str:
@@ -142,7 +152,9 @@ def image_base(topic: str) -> str:
     return next((topic.removesuffix(end) for end in _TRANSPORTS if topic.endswith(end)), topic)
 
 
-def _camera(name: str, calibration: Calibration, topic: str, layout: ImageLayout, notes: list[str]) -> Camera:
+def _camera(
+    name: str, calibration: Calibration, topic: str, layout: ImageLayout, undistort: bool, notes: list[str]
+) -> tuple[Camera, Lens | None]:
     p, k = calibration.p, calibration.k
     is_rectified = "rect" in image_base(topic).rpartition("/")[2] and bool(p) and p[0] > 0 and p[5] != 0
     fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if is_rectified else (k[0], k[4], k[2], k[5])
@@ -157,10 +169,23 @@ def _camera(name: str, calibration: Calibration, topic: str, layout: ImageLayout
     if size != layout.size:
         notes.append(f"{name}: intrinsics of {size[0]}x{size[1]} are scaled to the images' {_size(layout)}")
     notes.append(f"{topic}: intrinsics from {name}{' (rectified: P)' if is_rectified else ''}")
-    if calibration.is_distorted and not is_rectified:
-        notes.append(f"{name}: has lens distortion, which is not corrected: images are taken as undistorted")
     notes.extend(filter(None, [principal_point_note(camera)]))
-    return camera
+    if is_rectified or not calibration.is_distorted:
+        return camera, None
+    lens = _lens(camera, calibration) if undistort else None
+    if lens:
+        notes.append(f"{name}: its lens distortion is removed from depth and colour (undistort)")
+    else:
+        notes.append(f"{name}: has lens distortion, which is not corrected: images are taken as undistorted")
+    return camera, lens
+
+
+def _lens(camera: Camera, calibration: Calibration) -> Lens | None:
+    """The lens of a calibration; None where its model is not OpenCV's polynomial."""
+    known = calibration.model.lower() in _BROWN_MODELS and len(calibration.d) in (4, 5, 8)
+    if not known or not np.isfinite(calibration.d).all():
+        return None
+    return Lens(camera, (*calibration.d, 0.0)[: max(len(calibration.d), 5)])
 
 
 def one_per_stamp(topic: str, seen: Sequence[Seen[Item]], notes: list[str]) -> list[Seen[Item]]:
