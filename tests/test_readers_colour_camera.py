@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hodge_adapters.seven_scenes.colour import colour_pixels
+from hodge_adapters.images.second_camera import colour_pixels
+from hodge_adapters.seven_scenes.colour import kinect_colour_camera
 from hodge_adapters.seven_scenes.reader import SevenScenesReader
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera
@@ -23,7 +24,7 @@ def test_a_camera_to_the_right_sees_things_further_left() -> None:
     """Of 525 pixels of focal length, 2.5 cm beside: 6.5625 pixels at 2 m, twice as many at 1 m."""
     depth = np.full((6, 8), 2.0, np.float32)
     depth[:, 4:] = 1.0
-    columns, rows = colour_pixels(depth, DEPTH_CAMERA)
+    columns, rows = colour_pixels(depth, DEPTH_CAMERA, kinect_colour_camera(DEPTH_CAMERA))
     wider = 525 / 585
     expected = 4 + wider * (np.arange(8) - 4) - np.repeat([6.5625, 13.125], 4)
     np.testing.assert_allclose(columns[2], expected, atol=1e-5)
@@ -33,7 +34,7 @@ def test_a_camera_to_the_right_sees_things_further_left() -> None:
 def test_pixels_without_depth_are_taken_for_the_median() -> None:
     depth = np.full((6, 8), 2.0, np.float32)
     depth[0, 0] = 0.0
-    columns, _ = colour_pixels(depth, DEPTH_CAMERA)
+    columns, _ = colour_pixels(depth, DEPTH_CAMERA, kinect_colour_camera(DEPTH_CAMERA))
     assert columns[0, 0] == pytest.approx(columns[1, 0])
 
 

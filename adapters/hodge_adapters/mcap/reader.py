@@ -19,6 +19,7 @@ from pydantic.dataclasses import dataclass
 from hodge_adapters.association import nearest_in_runs
 from hodge_adapters.images.camera_files import Intrinsics, checked
 from hodge_adapters.images.frames import Lens, undistorted
+from hodge_adapters.images.second_camera import SecondCamera, encoded_on_depth_pixels, read_on_depth_pixels
 from hodge_adapters.mcap.clouds import lies_far, read_points
 from hodge_adapters.mcap.files import find_files, sniff_recording
 from hodge_adapters.mcap.fixes import positions_of
@@ -33,6 +34,7 @@ from hodge_adapters.mcap.topics import (
     find_camera,
     named_topic,
     one_per_stamp,
+    second_cameras,
     split_depth,
 )
 from hodge_adapters.text_rows import listed
@@ -62,6 +64,11 @@ class McapReader:
         True,
         description="undistort depth and colour by D of the calibration, of the models plumb_bob and "
         "rational_polynomial; topics named rect are undistorted already",
+    )
+    colour_camera: Literal["auto", "same"] = Field(
+        "auto",
+        description="same: colour lies on the pixels of depth; auto: so where both have one coordinate frame and size, "
+        "else it is brought there by the calibrations and transforms of both",
     )
     depth_scale: float | None = Field(
         None,
@@ -153,8 +160,10 @@ class McapReader:
         camera, lens = found
         if self.colour_topic:
             colour = dict([named_topic(colour, self.colour_topic, "colour_topic")])
-        colour_topic = best_colour(colour, topic, images[0], notes)
-        coloured = self._associated(topic, images, colour_topic, colour, notes)
+        seconds, others = self._second_cameras(recording, images, camera, colour)
+        colour_topic = best_colour(colour, topic, images[0], seconds, others, notes)
+        second = seconds.get(colour_topic or "")
+        coloured = self._associated(topic, images, colour_topic, colour, second, notes)
         units, frames = self.depth_scale or UNITS_PER_METRE, []
         given: dict[str, Any] = {"units_per_metre": self.depth_scale, "no_depth": self.no_depth}
         for row, (image, other) in enumerate(zip(images, coloured, strict=True)):
@@ -169,8 +178,18 @@ class McapReader:
                 encoded_colour=_encoded_colour(other),
                 colour_delay_s=other.stamp_s - image.stamp_s if other else 0.0,
             )
-            frames.append(undistorted(frame, lens, units) if lens else frame)
+            if second:
+                frame = replace(frame, read_colour=None)
+            frame = undistorted(frame, lens, units) if lens else frame
+            frames.append(_beside(frame, other, second) if second and other else frame)
         return frames, _coordinate_frame(topic, images, notes)
+
+    def _second_cameras(
+        self, recording: Recording, images: Sequence[Seen[ImageLayout]], camera: Camera, colour: ImageTopics
+    ) -> tuple[dict[str, SecondCamera], set[str]]:
+        if self.colour_camera == "same":
+            return {}, set()
+        return second_cameras(recording, images[0], camera, _stamps(images), colour, undistort=self.undistort)
 
     def _associated(
         self,
@@ -178,6 +197,7 @@ class McapReader:
         images: Sequence[Seen[ImageLayout]],
         colour_topic: str | None,
         colour: ImageTopics,
+        second: SecondCamera | None,
         notes: list[str],
     ) -> list[Seen[ImageLayout] | None]:
         """The colour image of each depth image by header stamp, None where none is near."""
@@ -193,7 +213,12 @@ class McapReader:
             hint = ": are they on another clock?" if without == len(images) else ""
             limit = f"{self.max_difference_s:g} s by header stamp"
             notes.append(f"{without} depth images of {topic} have no colour of {colour_topic} within {limit}{hint}")
-        if others[0].frame_id != images[0].frame_id:
+        if second:
+            notes.append(
+                f"{colour_topic}: is of another camera than depth, and brought onto its pixels by the calibrations and "
+                "transforms of both (colour_camera=same takes it as registered)"
+            )
+        elif others[0].frame_id != images[0].frame_id:
             frames = f"{images[0].frame_id or 'no frame'}, colour in {others[0].frame_id or 'no frame'}"
             notes.append(f"depth is in {frames}: colour is off by as much as these differ")
         return [others[column] if column >= 0 else None for column in columns.tolist()]
@@ -233,7 +258,9 @@ class McapReader:
     ) -> tuple[Camera, Lens | None] | None:
         if self.camera is not None:
             return checked(Intrinsics(*self.camera), "option camera").camera(image.layout.size), None
-        return find_camera(recording, topic, image, self.calibration_topic, notes, undistort=self.undistort)
+        return find_camera(
+            recording.calibrations, topic, image, self.calibration_topic, notes, undistort=self.undistort
+        )
 
     def _pick(self, topics: Mapping[str, Sequence[object]], name: str, what: str, notes: list[str]) -> str:
         if name:
@@ -246,6 +273,17 @@ class McapReader:
 
 def _stamps(seen: Sequence[Seen[Layout]]) -> Floats:
     return np.array([item.stamp_s for item in seen], float)
+
+
+def _beside(frame: Frame, image: Seen[ImageLayout], second: SecondCamera) -> Frame:
+    """The frame with colour of a camera beside that of its depth, on the pixels of depth."""
+    assert frame.read_depth is not None and frame.camera is not None
+    given = partial(read_colour, image.payload, image.layout), frame.read_depth, frame.camera, second
+    return replace(
+        frame,
+        read_colour=partial(read_on_depth_pixels, *given),
+        encoded_colour=partial(encoded_on_depth_pixels, *given),
+    )
 
 
 def _encoded_colour(image: Seen[ImageLayout] | None) -> Callable[[], EncodedImage] | None:

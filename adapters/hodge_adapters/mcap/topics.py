@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import TypeVar
@@ -14,11 +14,12 @@ from hodge_adapters.association import clock_runs
 from hodge_adapters.images.camera_files import principal_point_note, resized
 from hodge_adapters.images.frames import Lens
 from hodge_adapters.images.pixels import same_shape
+from hodge_adapters.images.second_camera import SecondCamera
 from hodge_adapters.mcap.images import ImageLayout
 from hodge_adapters.mcap.recording import Calibration, Recording, Seen
 from hodge_adapters.text_rows import listed
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Camera
+from hodge_pipeline.types import Camera, Floats
 from hodge_pipeline.types.text import counted
 
 Item = TypeVar("Item")
@@ -27,6 +28,10 @@ ImageTopics = Mapping[str, Sequence[Seen[ImageLayout]]]
 _TRANSPORTS = ("/compressedDepth", "/compressed", "/raw", "/zstd", "/ffmpeg", "/theora")
 _BROWN_MODELS = frozenset(("", "plumb_bob", "rational_polynomial", "brown_conrady"))
 """Whose D is OpenCV's: four, five or, with a denominator, eight numbers."""
+SAME_CAMERA = 1e-3
+"""Relative difference of intrinsics up to which they are copies, but for digits, as those of registered images are."""
+SAME_MOTION = 1e-3
+"""Metres, and of a rotation's matrix, by which the transform between two cameras of one sensor may vary: a pixel."""
 _PINHOLE_MODELS = frozenset(
     (
         "", "none", "pinhole", "plumb_bob", "rational_polynomial", "brown_conrady", "modified_brown_conrady",
@@ -78,22 +83,35 @@ def best_depth(depth: ImageTopics, colour: ImageTopics, notes: list[str]) -> str
     return ranked[0]
 
 
-def best_colour(colour: ImageTopics, depth_topic: str, first: Seen[ImageLayout], notes: list[str]) -> str | None:
-    """The colour topic on the same pixel grid as the depth; None, with a note, where there is none."""
-    fitting = [topic for topic in colour if colour[topic][0].layout.size == first.layout.size]
+def best_colour(
+    colour: ImageTopics,
+    depth_topic: str,
+    first: Seen[ImageLayout],
+    seconds: Mapping[str, SecondCamera],
+    others: Collection[str],
+    notes: list[str],
+) -> str | None:
+    """The colour topic on the same pixel grid as the depth, or of a camera that is known beside it (`seconds`); None,
+    with a note, where there is none. `others` are of cameras of which it is not known where they are.
+    """
+    fitting = [
+        topic
+        for topic in colour
+        if topic in seconds or (colour[topic][0].layout.size == first.layout.size and topic not in others)
+    ]
     if not fitting:
         if colour:
             sizes = [f"{topic} {_size(colour[topic][0].layout)}" for topic in sorted(colour)]
-            notes.append(
-                f"no colour: depth is {_size(first.layout)}, there is {listed(sizes)}: record registered depth"
-            )
+            told = f"no colour: depth is {_size(first.layout)}, there is {listed(sizes)}"
+            notes.append(f"{told}: record registered depth, or camera_info of both and /tf_static")
         return None
 
-    def rank(topic: str) -> tuple[bool, bool, int, int, str]:
+    def rank(topic: str) -> tuple[bool, bool, bool, int, int, str]:
         image = colour[topic][0]
         grey = image.layout.encoding in ("mono8", "8UC1")
         shared = len(_common_start(topic, depth_topic))
-        return image.frame_id != first.frame_id, grey, -shared, -len(colour[topic]), topic
+        rectified = is_rectified(topic) != is_rectified(depth_topic)
+        return image.frame_id != first.frame_id, grey, rectified, -shared, -len(colour[topic]), topic
 
     ranked = sorted(fitting, key=rank)
     if len(ranked) > 1:
@@ -101,8 +119,65 @@ def best_colour(colour: ImageTopics, depth_topic: str, first: Seen[ImageLayout],
     return ranked[0]
 
 
-def find_camera(
+def second_cameras(
     recording: Recording,
+    depth: Seen[ImageLayout],
+    depth_camera: Camera,
+    stamps_s: Floats,
+    colour: ImageTopics,
+    *,
+    undistort: bool,
+) -> tuple[dict[str, SecondCamera], set[str]]:
+    """The cameras of the colour topics that are not on the depth's grid, by their calibrations and the transforms; and
+    the topics of another camera whose place is not known.
+    """
+    found: dict[str, SecondCamera] = {}
+    unknown: set[str] = set()
+    for topic, (first, *_) in colour.items():
+        known = {
+            name: calibration
+            for name, calibration in recording.calibrations.items()
+            if _is_beside(name, topic) or calibration.frame_id == first.frame_id
+        }
+        if _shares_grid(depth, first) or not first.frame_id or not known:
+            continue
+        own = find_camera(known, topic, first, "", [], undistort=undistort)
+        if own is None or _is_copy(own[0], depth_camera):
+            continue
+        same_axes = np.broadcast_to(np.eye(4), (1, 4, 4)) if first.frame_id == depth.frame_id else None
+        poses = (
+            recording.transforms.lookup(first.frame_id, depth.frame_id, stamps_s) if same_axes is None else same_axes
+        )
+        motion = None if poses is None else _held(poses)
+        if motion is None:
+            unknown.add(topic)
+        else:
+            found[topic] = _second(own, motion, depth_camera)
+    return found, unknown
+
+
+def _is_copy(one: Camera, other: Camera) -> bool:
+    """Whether these are the same intrinsics."""
+    a, b = ((c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (one, other))
+    return np.allclose(a, b, rtol=SAME_CAMERA, atol=0)
+
+
+def _held(poses: Floats) -> Floats | None:
+    """The motion (4, 4) that all of these known poses (N, 4, 4) are; None where they differ, or none is known."""
+    known = poses[np.isfinite(poses).all(axis=(1, 2))]
+    return known[0] if len(known) and np.ptp(known, axis=0).max() < SAME_MOTION else None
+
+
+def _second(own: tuple[Camera, Lens | None], second_from_depth: Floats, depth: Camera) -> SecondCamera:
+    """A camera beside that of depth, of images with no more pixels than depth has for the same angle."""
+    camera, lens = own
+    shrink = min(depth.fx / camera.fx, 1.0)
+    size = max(round(shrink * camera.width), 1), max(round(shrink * camera.height), 1)
+    return SecondCamera(resized(camera, size), tuple(second_from_depth[:3].ravel().tolist()), lens)
+
+
+def find_camera(
+    known: Mapping[str, Calibration],
     topic: str,
     image: Seen[ImageLayout],
     calibration_topic: str,
@@ -114,7 +189,6 @@ def find_camera(
     notes, where none fits. One of another size is scaled where the shape is the same and its topic lies beside that of
     the images.
     """
-    known = recording.calibrations
     if calibration_topic:
         chosen, calibration = named_topic(known, calibration_topic, "calibration_topic")
         return _camera(chosen, calibration, topic, image.layout, undistort, notes)
@@ -122,12 +196,9 @@ def find_camera(
         if known[name].model.lower() not in _PINHOLE_MODELS:
             notes.append(f"{name}: calibration left out: its model {known[name].model!r} is no pinhole camera")
 
-    def is_beside(name: str) -> bool:
-        return name.rpartition("/")[0] == image_base(topic).rpartition("/")[0]
-
     def fits(name: str, size: tuple[int, int]) -> bool:
         same = size in (image.layout.size, (0, 0))
-        return same or (is_beside(name) and same_shape(size, image.layout.size))
+        return same or (_is_beside(name, topic) and same_shape(size, image.layout.size))
 
     fitting = {
         name: calibration
@@ -141,10 +212,25 @@ def find_camera(
         return None
 
     def rank(name: str) -> tuple[bool, bool, int, str]:
-        return not is_beside(name), fitting[name].frame_id != image.frame_id, -len(_common_start(name, topic)), name
+        return (
+            not _is_beside(name, topic),
+            fitting[name].frame_id != image.frame_id,
+            -len(_common_start(name, topic)),
+            name,
+        )
 
     chosen = min(fitting, key=rank)
     return _camera(chosen, fitting[chosen], topic, image.layout, undistort, notes)
+
+
+def _is_beside(name: str, topic: str) -> bool:
+    """Whether a calibration's topic lies beside that of images."""
+    return name.rpartition("/")[0] == image_base(topic).rpartition("/")[0]
+
+
+def is_rectified(topic: str) -> bool:
+    """Whether images are undistorted, as their topic's name says."""
+    return "rect" in image_base(topic).rpartition("/")[2]
 
 
 def image_base(topic: str) -> str:
@@ -156,8 +242,8 @@ def _camera(
     name: str, calibration: Calibration, topic: str, layout: ImageLayout, undistort: bool, notes: list[str]
 ) -> tuple[Camera, Lens | None]:
     p, k = calibration.p, calibration.k
-    is_rectified = "rect" in image_base(topic).rpartition("/")[2] and bool(p) and p[0] > 0 and p[5] != 0
-    fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if is_rectified else (k[0], k[4], k[2], k[5])
+    by_p = is_rectified(topic) and bool(p) and p[0] > 0 and p[5] != 0
+    fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if by_p else (k[0], k[4], k[2], k[5])
     told = calibration.width, calibration.height
     size = told if any(told) else layout.size
     if not same_shape(size, layout.size):
@@ -168,9 +254,9 @@ def _camera(
     camera = resized(Camera(*size, fx, fy, cx, cy), layout.size)
     if size != layout.size:
         notes.append(f"{name}: intrinsics of {size[0]}x{size[1]} are scaled to the images' {_size(layout)}")
-    notes.append(f"{topic}: intrinsics from {name}{' (rectified: P)' if is_rectified else ''}")
+    notes.append(f"{topic}: intrinsics from {name}{' (rectified: P)' if by_p else ''}")
     notes.extend(filter(None, [principal_point_note(camera)]))
-    if is_rectified or not calibration.is_distorted:
+    if by_p or not calibration.is_distorted:
         return camera, None
     lens = _lens(camera, calibration) if undistort else None
     if lens:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from hodge_adapters.images import pixels
 from hodge_adapters.images.frames import as_jpeg
+from hodge_adapters.images.second_camera import SecondCamera, on_depth_pixels
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bytes, Camera, EncodedImage, Floats, Floats32
 from hodge_pipeline.types.arrays import evenly
@@ -20,10 +21,6 @@ from hodge_pipeline.types.image_edges import FEWEST_EDGES, change_along_rows, de
 COLOUR_FOCAL, BASELINE_M = 525.0, 0.025
 """Focal length in pixels and baseline of a Kinect's colour camera as built: parallel to the depth camera."""
 SIZE = 640, 480
-ASSUMED_DEPTH_M = 2.0
-"""Depth that an image without any is taken to have."""
-MEDIAN_STRIDE = 4
-"""Every so many rows and columns are used for the median depth: all would take as long as the rest."""
 FRAMES, FEWEST_FRAMES = 8, 3
 """Frames tested, evenly spread; frames that are needed."""
 LEAST_CHANGE = 1.0
@@ -94,32 +91,17 @@ def _at_infinity(u: Floats, v: Floats, camera: Camera) -> tuple[Floats, Floats]:
     return wider_u * (u - camera.cx) + camera.cx, wider_v * (v - camera.cy) + camera.cy
 
 
-def colour_pixels(depth_m: Floats32, camera: Camera) -> tuple[Floats32, Floats32]:
-    """For each pixel of the depth image (H, W) the column and row where the colour camera sees it."""
-    some = depth_m[::MEDIAN_STRIDE, ::MEDIAN_STRIDE]
-    known = some[some > 0]
-    middle = np.median(known) if len(known) else ASSUMED_DEPTH_M
-    columns, rows = _all_at_infinity(camera)
-    parallax = np.float32(COLOUR_FOCAL * BASELINE_M) / np.where(depth_m > 0, depth_m, np.float32(middle))
-    return np.asarray(columns - parallax, np.float32), rows
-
-
-@lru_cache(maxsize=2)
-def _all_at_infinity(camera: Camera) -> tuple[Floats32, Floats32]:
-    v, u = np.indices((camera.height, camera.width), dtype=float)
-    columns, rows = _at_infinity(u, v, camera)
-    return columns.astype(np.float32), rows.astype(np.float32)
+def kinect_colour_camera(camera: Camera) -> SecondCamera:
+    """A Kinect's colour camera, beside this depth camera."""
+    colour = replace(camera, fx=COLOUR_FOCAL, fy=COLOUR_FOCAL)
+    return SecondCamera(colour, (1.0, 0.0, 0.0, -BASELINE_M, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0))
 
 
 def read_registered_colour(path: Path, depth: DepthFile) -> Bytes:
-    """Colour (H, W, 3) of a Kinect on the pixels of its depth image, black outside the colour camera's view.
-
-    Pixels without depth get the median depth. Points hidden from the colour camera get the colour of what hides them:
-    a rim of a few pixels at a baseline of 2.5 cm.
-    """
+    """Colour (H, W, 3) of a Kinect on the pixels of its depth image, black outside the colour camera's view."""
     image = pixels.read_colour(path, size=depth.size)
-    seen = colour_pixels(_read_last(depth, _changed(depth.path)), depth.camera)
-    return pixels.resampled_colour(image, *seen)
+    depth_m = _read_last(depth, _changed(depth.path))
+    return on_depth_pixels(image, depth_m, depth.camera, kinect_colour_camera(depth.camera))
 
 
 def encoded_registered_colour(path: Path, depth: DepthFile) -> EncodedImage:
