@@ -317,6 +317,9 @@ def test_what_the_lens_bent_is_straight(tmp_path: Path, model: str, more: list[f
     coded = cv2.imdecode(np.frombuffer(frame.encoded_depth().contents, np.uint8), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(coded, stored(frame, 1000))
     np.testing.assert_array_equal(stored(bent, 1000), seen)
+    (alone,) = McapReader(frames="colour").open(tmp_path / "log.mcap").frames
+    assert alone.read_colour
+    np.testing.assert_array_equal(alone.read_colour(), frame.read_colour())
 
 
 def test_stamps_that_mean_nothing(tmp_path: Path) -> None:
@@ -357,3 +360,23 @@ def test_messages_stay_in_the_order_of_the_recording_where_its_clock_jumps_back(
     assert f"{DEPTH}: the clock jumps back 1 time: messages are taken in the order of the recording" in source.notes
     colours = [frame.read_colour() for frame in source.frames if frame.read_colour is not None]
     assert [int(image.max()) for image in colours] == list(range(30))  # not those of the same stamp before the jump
+
+
+def test_colour_that_is_of_another_clock_is_a_doubt(tmp_path: Path) -> None:
+    doubts = {}
+    for late_s in (0.0, 5.0):
+        log = depth_log(some_images(3))
+        for row in range(3):
+            head = foxglove_header(100 + row / 10 + late_s, OPTICAL)
+            log.add(COLOUR, RAW, {**head, **raw_image(np.zeros((HEIGHT, WIDTH, 3), np.uint8), "rgb8")}, CDR)
+        doubts[late_s] = McapReader().open(log.write(tmp_path / "log.mcap")).doubts
+    assert not doubts[0.0]
+    assert [(note.kind, note.count, note.detail) for note in doubts[5.0]] == [("colour unpaired", 3, "3")]
+
+
+def test_a_recording_that_breaks_off_is_named(tmp_path: Path) -> None:
+    path = write_depth_log(tmp_path / "log.mcap", some_images(9), chunk_size=400)
+    assert not McapReader().open(path).doubts
+    path.write_bytes(path.read_bytes()[: path.read_bytes().rfind(b"/cam/depth/image") // 2])
+    (doubt,) = McapReader().open(path).doubts
+    assert doubt.kind == "recording incomplete" and str(doubt).startswith("1 file of the recording is cut off")

@@ -220,6 +220,7 @@ def test_colour_that_is_absent_or_too_late(folder: Path) -> None:
     ]
     source = TumReader(max_difference_s=0.005).open(folder)
     assert colour_names(source) == [None] * 3
+    assert [note.kind for note in source.doubts][-1:] == ["colour unpaired"]
     assert (
         "3 of 3 depth images have no colour image within 0.005 s, the nearest is 0.01 s away: set max_difference_s, or "
         "are they of two clocks?"

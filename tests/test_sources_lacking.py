@@ -7,9 +7,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-from hodge_pipeline.sources.lacking import lacking
-from hodge_pipeline.types import Frame, Source, Trajectory
+from hodge_pipeline.errors import SourceError
+from hodge_pipeline.sources.lacking import check_measurable, lacking
+from hodge_pipeline.types import Camera, Frame, Source, Trajectory
 
 POSED = Frame(
     0,
@@ -41,3 +43,10 @@ def test_a_trajectory_that_is_of_no_frame_is_said() -> None:
     (note,) = said(*frames)
     assert note.startswith("the trajectory beside the 3 frames has no pose near in time of any")
     assert said(*frames, replace(frames[0], true_world_from_cam=np.eye(4))) == []
+
+
+def test_where_nothing_can_be_registered_the_reader_says_why() -> None:
+    check_measurable(Source("s", Path("s"), (Frame(0, 0.0), replace(POSED, camera=Camera(4, 4, 4, 4, 2, 2)))))
+    left_out = "/depth: 40 left out: a message with pixels of the kind '64FC1'"
+    with pytest.raises(SourceError, match=f"s: no frame has depth with a camera.*; {left_out}: hodge inspect"):
+        check_measurable(Source("s", Path("s"), (Frame(0, 0.0), POSED), notes=(left_out,)))

@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types.notes import Note
 
 NEIGHBOURS = 4
 """How many stamps on each side are looked at; more would only matter where stamps crowd within the tolerance."""
 JUMP, FEWEST_OF_RUN = 10.0, 10
 """Usual steps by which a clock jumps back, and stamps to a jump: more of either are stamps out of order."""
+
+UNPAIRED = 0.6
+"""The share of depth images without colour from which it is a doubt: colour at half the rate leaves half, and a few."""
+
+
+def unpaired_doubts(paired: Sequence[bool]) -> tuple[Note, ...]:
+    """A doubt where most depth images have no colour image although there are some: `paired` of each depth image."""
+    without = len(paired) - sum(paired)
+    return (Note("colour unpaired", without, str(len(paired))),) if without > UNPAIRED * len(paired) else ()
 
 
 def clock_runs(stamps_s: Floats, follows: Bools | None = None) -> Ints:

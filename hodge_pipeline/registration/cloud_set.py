@@ -71,11 +71,6 @@ def in_blocks(frames: Sequence[Frame]) -> list[Sequence[Frame]]:
 
 def no_clouds(frames: Sequence[Frame], first: object) -> SourceError:
     """What to say where no frame gave a point; `first`: what was wrong with the first of them."""
-    if frames and not any(frame.read_points or (frame.read_depth and frame.camera) for frame in frames):
-        return SourceError(
-            "no frame has depth with a camera, or points, so that there is nothing to register: hodge inspect says "
-            "what the source is good for"
-        )
     return SourceError(
         f"none of the {len(frames)} frames gave a point cloud: hodge inspect shows size and range of their depth; the "
         f"first: {first}"

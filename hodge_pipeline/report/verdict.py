@@ -37,6 +37,7 @@ REFINEMENTS: dict[str, Outcome] = {
 }  # fmt: skip
 LEADS = {
     "images missing": "{count} of {detail} are missing",
+    "colour unpaired": "{count} of {detail} depth images have no colour image near in time",
     "other scale": "in another scale than the truth",
     "truth convention": "the truth seems to be in another convention",
     "truth clock": "{detail}",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Source
 from hodge_pipeline.types.notes import Note
 
@@ -16,3 +17,14 @@ def lacking(source: Source) -> tuple[Note, ...]:
     if source.trajectory is not None and not posed:
         notes.append(Note("no pose near", len(source.frames)))
     return tuple(notes)
+
+
+def check_measurable(source: Source) -> None:
+    """Raise `SourceError`, with what the reader left out, where no frame has depth with a camera, or points."""
+    if any(frame.read_points or (frame.read_depth and frame.camera) for frame in source.frames):
+        return
+    why = "".join(f"; {note}" for note in source.notes)
+    raise SourceError(
+        f"{source.path}: no frame has depth with a camera, or points, so that there is nothing to register{why}: hodge "
+        "inspect says what the source is good for"
+    )

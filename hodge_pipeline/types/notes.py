@@ -22,6 +22,8 @@ INPUTS = {
     "input changed": "{count} {count:file|files} of the input changed while the run read {count:it|them} ({detail}): "
     "run the same command again once {count:it stays as it is|they stay as they are}.",
     "images missing": "{count} of {detail} are missing: unpack or copy the whole sequence",
+    "colour unpaired": "{count} of {detail} depth images have no colour image near in time, although there are colour "
+    "images: are their stamps of one clock (source.reader.max_difference_s)?",
     "reader's doubt": "{detail}",
     "depth unit": "Depth is probably not in metres: {detail}.",
     "depth steps": "depth is of another sensor than a Kinect, Xtion, Astra or Structure sensor, or in another unit: "
@@ -70,6 +72,8 @@ DOUBTS = {
 }
 """What puts the result in doubt."""
 LOOKS = {
+    "recording incomplete": "{count} {count:file|files} of the recording {count:is|are} cut off or damaged: the "
+    "reader's notes tell what was read",
     "option unknown": "{detail}; made by another version: it is left out of what is shown",
     "other units": "{detail}",
     "mirrored": "scan {detail} seems mirrored, and is left apart: its reflection fits the scans around it clearly "

@@ -17,7 +17,7 @@ from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.report import run_files
 from hodge_pipeline.run_folder import Run, check_layout, end
 from hodge_pipeline.sources.colour_on_depth import image_doubts
-from hodge_pipeline.sources.lacking import lacking
+from hodge_pipeline.sources.lacking import check_measurable, lacking
 from hodge_pipeline.sources.opening import Fingerprints, changed_since, fingerprints, open_with_reader, remembered
 from hodge_pipeline.start.truth import with_truth
 from hodge_pipeline.store.log import logging_to
@@ -123,6 +123,7 @@ class _Run:
         )
         if not source.frames:
             raise SourceError(f"{path}: has no frames to register: give a sequence with depth or clouds")
+        check_measurable(source)
         self.store.note(*notes_of("reader", source.notes), *source.doubts)
         self.store.note(*image_doubts(source.frames), *lacking(source))
         if len(source.frames) == 1:

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.association import nearest_in_runs
+from hodge_adapters.association import nearest_in_runs, unpaired_doubts
 from hodge_adapters.images.camera_files import Intrinsics, checked
 from hodge_adapters.images.frames import Lens, undistorted
 from hodge_adapters.images.second_camera import SecondCamera, encoded_on_depth_pixels, read_on_depth_pixels
@@ -41,6 +41,7 @@ from hodge_adapters.text_rows import listed
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Camera, EncodedImage, Floats, Frame, Source
+from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.text import counted
 
 Layout = TypeVar("Layout")
@@ -108,7 +109,8 @@ class McapReader:
             notes.append(f"{recording.transforms.other_parents} transforms of frames with two parents left out")
         if recording.transforms.replaced:
             notes.append(f"{counted(recording.transforms.replaced, 'static transform')} replaced by a later, other one")
-        frames, camera_frame = self._frames(path, recording, notes)
+        doubts = [Note("recording incomplete", recording.complaints.incomplete)] * bool(recording.complaints.incomplete)
+        frames, camera_frame = self._frames(path, recording, notes, doubts)
         frames = frames[:: self.every]
         stamps_s = np.array([frame.stamp_s for frame in frames], float)
         options = PoseOptions(self.pose_topic, self.pose_child, self.world_frame, self.max_gap_s)
@@ -122,12 +124,15 @@ class McapReader:
             frames=tuple(_with_pose(frame, pose) for frame, pose in zip(frames, poses.of_frames, strict=True)),
             trajectory=poses.trajectory,
             notes=tuple(notes),
+            doubts=tuple(doubts),
             files=listing.all,
             contents=recording.contents(),
             positions=positions,
         )
 
-    def _frames(self, path: Path, recording: Recording, notes: list[str]) -> tuple[list[Frame], str]:
+    def _frames(
+        self, path: Path, recording: Recording, notes: list[str], doubts: list[Note]
+    ) -> tuple[list[Frame], str]:
         """All frames, and the coordinate frame of their camera."""
         depth, colour = split_depth(recording.images, notes)
         kind = self.frames
@@ -136,7 +141,7 @@ class McapReader:
             if depth and recording.clouds:
                 notes.append(f"point clouds of {listed(sorted(recording.clouds))} not taken: see option frames")
         if kind == "depth" and depth:
-            return self._depth_frames(path, recording, depth, colour, notes)
+            return self._depth_frames(path, recording, depth, colour, notes, doubts)
         if kind == "points" and recording.clouds:
             return self._cloud_frames(recording, notes)
         if kind == "colour" and colour:
@@ -146,7 +151,13 @@ class McapReader:
         return [], ""
 
     def _depth_frames(
-        self, path: Path, recording: Recording, depth: ImageTopics, colour: ImageTopics, notes: list[str]
+        self,
+        path: Path,
+        recording: Recording,
+        depth: ImageTopics,
+        colour: ImageTopics,
+        notes: list[str],
+        doubts: list[Note],
     ) -> tuple[list[Frame], str]:
         named = named_topic(depth, self.depth_topic, "depth_topic")[0] if self.depth_topic else ""
         topic = named or best_depth(depth, colour, notes)
@@ -164,6 +175,8 @@ class McapReader:
         colour_topic = best_colour(colour, topic, images[0], seconds, others, notes)
         second = seconds.get(colour_topic or "")
         coloured = self._associated(topic, images, colour_topic, colour, second, notes)
+        if colour_topic:
+            doubts += unpaired_doubts([image is not None for image in coloured])
         units, frames = self.depth_scale or UNITS_PER_METRE, []
         given: dict[str, Any] = {"units_per_metre": self.depth_scale, "no_depth": self.no_depth}
         for row, (image, other) in enumerate(zip(images, coloured, strict=True)):
@@ -239,7 +252,7 @@ class McapReader:
     def _colour_frames(self, recording: Recording, colour: ImageTopics, notes: list[str]) -> tuple[list[Frame], str]:
         topic = self._pick(colour, self.colour_topic, "colour_topic", notes)
         images = one_per_stamp(topic, colour[topic], notes)
-        camera = (self._camera(recording, topic, images[0], notes) or (None,))[0]
+        camera, lens = self._camera(recording, topic, images[0], notes) or (None, None)
         notes.append(f"frames are the images of {topic} alone: there is neither depth nor a point cloud")
         frames = [
             Frame(
@@ -251,6 +264,8 @@ class McapReader:
             )
             for row, image in enumerate(images)
         ]
+        if lens:
+            frames = [undistorted(frame, lens, UNITS_PER_METRE) for frame in frames]
         return frames, _coordinate_frame(topic, images, notes)
 
     def _camera(

@@ -55,7 +55,7 @@ class BagFile(MessageFile):
                     raise BreaksOff
                 at = start + length
             except BreaksOff:
-                self.complaints.say(f"{self.path.name}: cut off at byte {at} of {end}: {self.read_so_far()}")
+                self.complaints.loses(f"{self.path.name}: cut off at byte {at} of {end}: {self.read_so_far()}")
                 return
             except Malformed as error:
                 self.complaints.count(self.path.name, str(error))

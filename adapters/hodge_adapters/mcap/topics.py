@@ -260,7 +260,7 @@ def _camera(
         return camera, None
     lens = _lens(camera, calibration) if undistort else None
     if lens:
-        notes.append(f"{name}: its lens distortion is removed from depth and colour (undistort)")
+        notes.append(f"{name}: its lens distortion is removed from the images (undistort)")
     else:
         notes.append(f"{name}: has lens distortion, which is not corrected: images are taken as undistorted")
     return camera, lens

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hodge_adapters.association import clock_runs, nearest_in_runs
+from hodge_adapters.association import clock_runs, nearest_in_runs, unpaired_doubts
 from hodge_adapters.images import pixels
 from hodge_adapters.images.frames import image_frame
 from hodge_adapters.text_rows import Row, inside, listed, read_rows, to_floats
@@ -105,7 +105,7 @@ def read_pairs(folder: Path, max_difference_s: float, notes: list[str]) -> Stamp
         found.colour_delays_s[rows],
         found.files,
         found.runs[rows],
-        tuple(doubts[:1]),
+        (*doubts[:1], *found.doubts),
     )
 
 
@@ -136,7 +136,8 @@ def _from_lists(folder: Path, max_difference_s: float, notes: list[str]) -> Stam
         notes.append(f"{unpaired} of {len(colour)} colour images have no depth image within {max_difference_s:g} s")
     paired = [colour[column] if column >= 0 else None for column in columns.tolist()]
     delays_s = np.where(columns >= 0, np.append(colour_stamps_s, 0.0)[columns] - depth_stamps_s, 0.0)
-    return StampedImages(depth_stamps_s, depth, paired, delays_s, lists, runs)
+    doubts = unpaired_doubts((columns >= 0).tolist()) if colour else ()
+    return StampedImages(depth_stamps_s, depth, paired, delays_s, lists, runs, doubts)
 
 
 def stamped_images(folder: Path) -> list[tuple[float, Path]]:
