@@ -69,7 +69,7 @@ def test_a_recording_gives_the_poses_of_its_folder(tiny_sequence: Path, tmp_path
     log = write_rgbd(tmp_path / "log.mcap", frames, COMPRESSED, compressed_depth, CDR)
     runs = []
     for name, source, reader in (
-        ("seven_scenes", tiny_sequence, "source.reader={stage: tum, every: 2}"),  # the stages that mcap has
+        ("tum", tiny_sequence, "source.reader.every=2"),
         ("mcap", log, "source.reader.depth_scale=5000"),
     ):
         recipe = load_recipe(name, [*LIGHT, "fusion=[{stage: tsdf, voxel_m: 0.1, min_weight: 1}]", reader], source)
@@ -77,7 +77,7 @@ def test_a_recording_gives_the_poses_of_its_folder(tiny_sequence: Path, tmp_path
     folder, recording = runs
     assert recording.report.before == "start" and not recording.report.trajectories, "/tf is no truth"
     np.testing.assert_allclose(recording.result.world_from_cam, folder.result.world_from_cam, atol=1e-6)
-    assert folder.report.before == "odometry" and folder.report.trajectories
+    assert folder.report.trajectories
     assert (tmp_path / "mcap/mesh.ply").stat().st_size > 10000
 
 
