@@ -9,6 +9,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
+from hodge_adapters.images import pixels
 from hodge_adapters.images.frames import Lens, as_jpeg, undistorted_colour
 from hodge_pipeline.types import Bytes, Camera, EncodedImage, Floats32
 
@@ -63,8 +64,7 @@ def on_depth_pixels(image: Bytes, depth_m: Floats32, camera: Camera, second: Sec
 
     Points hidden from the second camera get the colour of what hides them: a rim of a few pixels beside near things.
     """
-    seen = colour_pixels(depth_m, camera, second)
-    return np.asarray(cv2.remap(image, *seen, cv2.INTER_LINEAR, borderValue=(0, 0, 0)), np.uint8)
+    return pixels.resampled_colour(image, *colour_pixels(depth_m, camera, second))
 
 
 def read_on_depth_pixels(
