@@ -7,15 +7,14 @@ a process, and nothing waits for the disk.
 from __future__ import annotations
 
 import atexit
-import functools
 import gc
 import hashlib
-import io
 import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -88,7 +87,7 @@ _textures: dict[str, object] = {}
 
 @pytest.hookimpl(wrapper=True)  # a fixture would come after those of a module, which make most of the runs
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """All plots are made; they are drawn in tests that are marked `draws`, and elsewhere the first of a kind.
+    """Every plot is drawn in tests that are marked `draws`, and elsewhere the first of a kind of data.
 
     They are half of what a small run costs, and gaps between the points of pictures, which stay open, a tenth.
     A run waits for the disk 200 times, which costs a tenth too and tells nothing while the power stays on.
@@ -103,26 +102,42 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
 
 def draw_once(patch: pytest.MonkeyPatch, folder: Path) -> None:
-    """Keep the first plot of a kind in the folder."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    """Keep the first plot of each kind of data in the folder, for all that come later."""
+    from hodge_pipeline.report import diagnosis_plots, edge_pictures, painting, plots
+    from hodge_pipeline.report.document import Picture
 
-    draw = FigureCanvasAgg.print_png
+    paint_it = painting.painted
 
-    @functools.wraps(draw)  # matplotlib passes what a signature has
-    def print_png(canvas: Any, target: io.BytesIO, **options: Any) -> None:
-        kind = [
-            (axes.get_xlabel(), axes.get_ylabel(), axes.get_xscale(), axes.get_yscale(), axes.has_data())
-            + (bool(axes.lines), bool(axes.collections), bool(axes.patches))
-            for axes in canvas.figure.axes
-        ]
-        kept = folder / f"drawn-{hashlib.sha256(repr(kind).encode()).hexdigest()[:16]}.png"
+    def painted(title: str, caption: str, paint: Callable[[Any], None]) -> Picture:
+        data = [kind_of(cell.cell_contents) for cell in paint.__closure__ or ()]
+        kept = folder / f"drawn-{hashlib.sha256(repr((title, data)).encode()).hexdigest()[:16]}.png"
         if not kept.exists():
-            draw(canvas, new := io.BytesIO(), **options)
-            (draft := kept.with_suffix(f".{os.getpid()}")).write_bytes(new.getvalue())
+            (draft := kept.with_suffix(f".{os.getpid()}")).write_bytes(paint_it(title, caption, paint).image)
             draft.rename(kept)
-        target.write(kept.read_bytes())
+        return Picture(title, caption, kept.read_bytes())
 
-    patch.setattr(FigureCanvasAgg, "print_png", print_png)
+    for module in (diagnosis_plots, edge_pictures, painting, plots):
+        patch.setattr(module, "painted", painted)
+
+
+def kind_of(data: object) -> object:
+    """What decides how data are drawn: which are there, none, one or many of them, finite and equal or not."""
+    from hodge_pipeline.report.contents import Report
+
+    if isinstance(data, Report):
+        data = (data.pictures, data.scores, data.loops, data.has_metres, data.source.vertex)
+    if isinstance(data, np.ndarray):
+        shape = tuple(min(size, 2) for size in data.shape)
+        known = data[np.isfinite(data)] if data.dtype.kind in "iuf" else data
+        return shape, min(known.size, 2), known.size == data.size, bool(known.size and (known == known.flat[0]).all())
+    if isinstance(data, (bool, str)):
+        return data
+    if isinstance(data, (list, tuple, dict)):
+        named = dict(enumerate(data)) if isinstance(data, (list, tuple)) else data
+        return sorted({repr((name if isinstance(name, str) else "", kind_of(one))) for name, one in named.items()})
+    if is_dataclass(data):
+        return [kind_of(getattr(data, one.name)) for one in fields(data)]
+    return type(data).__name__
 
 
 def texture_once(patch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ import math
 import types
 import typing
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -99,7 +100,7 @@ def _typed(folder: Path, plain: Any, kind: Any, arrays: Mapping[str, NDArray[Any
     if kind is Path:
         return _inside(folder, plain)
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-        hints = get_type_hints(kind)
+        hints = _types_of(kind)
         return kind(**{name: _typed(folder, item, hints[name], arrays) for name, item in plain.items()})
     if origin is tuple:
         item = [parts[0]] * len(plain) if parts[-1] is ... else list(parts)
@@ -109,6 +110,11 @@ def _typed(folder: Path, plain: Any, kind: Any, arrays: Mapping[str, NDArray[Any
     if isinstance(plain, dict):
         return {key: _typed(folder, each, parts[1], arrays) for key, each in plain.items()}
     return plain
+
+
+@cache  # `get_type_hints` compiles what each field is annotated with
+def _types_of(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
 
 
 def _inside(folder: Path, name: str) -> Path:
