@@ -37,6 +37,7 @@ class Monitor:
     RSS has grown by `GROWTH` and reused in between.
     """
 
+    _processes: list[psutil.Process] = field(default_factory=lambda: [psutil.Process()])
     _cpu_by_process: dict[tuple[int, float], float] = field(default_factory=dict)
     _largest_rss: float = 0.0
     _pss_share: float = 1.0
@@ -47,7 +48,7 @@ class Monitor:
         """A `Cost` that is filled when the block ends."""
         cost = Cost()
         stop = threading.Event()
-        self._sample(cost)
+        self._sample(cost, self._processes)
         start_wall, start_cpu = time.perf_counter(), self._cpu_total()
         sampler = threading.Thread(target=self._watch, args=(cost, stop), daemon=True)
         sampler.start()
@@ -56,22 +57,28 @@ class Monitor:
         finally:
             stop.set()
             sampler.join()
-            self._sample(cost)
+            self._sample(cost, self._tree())
             cost.wall_s = time.perf_counter() - start_wall
             cost.cpu_s = self._cpu_total() - start_cpu
 
     def _watch(self, cost: Cost, stop: threading.Event) -> None:
         while not stop.wait(SAMPLE_SECONDS):
-            self._sample(cost)
+            self._sample(cost, self._tree())
 
     def _cpu_total(self) -> float:
         with self._lock:
             return sum(self._cpu_by_process.values())
 
-    def _sample(self, cost: Cost) -> None:
+    def _tree(self) -> list[psutil.Process]:
+        """This process and those below it, by a look at every process of the machine; a stage begins with the last."""
+        me = psutil.Process()
+        self._processes = [me, *me.children(recursive=True)]
+        return self._processes
+
+    def _sample(self, cost: Cost, processes: list[psutil.Process]) -> None:
         """Note the CPU time so far of each process of the tree, and the memory of all of them."""
-        me, resident, alive = psutil.Process(), 0, []
-        for process in [me, *me.children(recursive=True)]:
+        resident, alive = 0, []
+        for process in processes:
             try:
                 times = process.cpu_times()
                 with self._lock:

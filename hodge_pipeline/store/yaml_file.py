@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import dataclass
@@ -95,17 +94,12 @@ def parse_value(text: str, name: str) -> Document:
 
 def dump(data: dict[str, Any]) -> str:
     """The YAML text of plain data, block style, keys in their order."""
-    return _dumped(json.dumps(data))
-
-
-@lru_cache(maxsize=16)  # a run writes its recipe in its folder and in its report, which takes 80 ms each time
-def _dumped(data_json: str) -> str:
     out = StringIO()
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = False
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
     yaml.width = 120
-    yaml.dump(json.loads(data_json), out)
+    yaml.dump(data, out)
     return out.getvalue()
 
 
