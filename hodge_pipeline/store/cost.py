@@ -70,7 +70,7 @@ class Monitor:
             return sum(self._cpu_by_process.values())
 
     def _tree(self) -> list[psutil.Process]:
-        """This process and those below it, by a look at every process of the machine; a stage begins with the last."""
+        """The process and those below it, by a look at all of the machine; a stage begins with those found last."""
         me = psutil.Process()
         self._processes = [me, *me.children(recursive=True)]
         return self._processes
