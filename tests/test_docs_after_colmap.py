@@ -6,7 +6,7 @@ from pathlib import Path
 import pycolmap
 import pytest
 
-from test_refine_colmap import disturbed, error_px, noisy
+from colmap_data import disturbed, error_px, noisy
 
 PAGE = Path(__file__).parent.parent / "docs/after-colmap.md"
 

@@ -10,12 +10,12 @@ import pycolmap
 import pytest
 
 import hodge_pipeline
+from colmap_data import FREE, thinned
 from hodge_adapters.colmap.models import ColmapModels
 from hodge_adapters.colmap.ties import similarity
 from hodge_pipeline import se3
 from hodge_pipeline.refine.model_solve import calibrated
 from hodge_pipeline.types import Floats, ViewGraph
-from test_refine_colmap import FREE, thinned
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 from colmap import MOST_WORSE_PERCENT, PEER, compared, cpu_of, disturbed, same_bytes

@@ -13,6 +13,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from colmap_data import synthetic
 from hodge_adapters.colmap.cameras import pinhole_camera, undistortion
 from hodge_adapters.colmap.content import content_of
 from hodge_adapters.colmap.files import by_report
@@ -26,25 +27,6 @@ from hodge_pipeline.types import Camera, Frame, Source
 from readers_data import some_poses, write_colour, write_depth
 
 SIZE = (64, 48)
-
-
-def synthetic(folder: Path, model: str = "SIMPLE_RADIAL", database: bool = False, cameras_per_rig: int = 2):
-    """A rig model with exact observations, written by pycolmap as text and binary."""
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, cameras_per_rig, 4
-    options.num_points3D = 120
-    options.camera_model_id = getattr(pycolmap.CameraModelId, model)
-    options.camera_params = pycolmap.Camera.create_from_model_name(1, model, 1280.0, 1024, 768).params
-    for name in ("text", "binary"):
-        (folder / name).mkdir(parents=True)
-    base = pycolmap.Database.open(folder / "database.db") if database else None
-    pycolmap.set_random_seed(0)
-    made = pycolmap.synthesize_dataset(options, base) if base else pycolmap.synthesize_dataset(options)
-    if base:
-        base.close()
-    made.write_text(folder / "text")
-    made.write_binary(folder / "binary")
-    return made
 
 
 def edge_errors(source: Source) -> tuple[np.ndarray, np.ndarray]:

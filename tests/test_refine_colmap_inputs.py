@@ -14,6 +14,7 @@ from matplotlib.axis import Axis
 from typer.testing import CliRunner
 
 import hodge_pipeline
+from colmap_data import FREE, disturbed, noisy, synthetic
 from hodge_adapters.colmap.models import ColmapModels
 from hodge_adapters.colmap.reader import ColmapReader
 from hodge_adapters.colmap.writer import ColmapWriter
@@ -21,8 +22,6 @@ from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import CheckError, SourceError
 from hodge_pipeline.store.edge_table import read_edges
 from readers_data import write_colour
-from test_readers_colmap import synthetic
-from test_refine_colmap import FREE, disturbed, noisy
 
 NO_TRACKS = "set tracks=false"
 

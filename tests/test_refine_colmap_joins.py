@@ -10,11 +10,11 @@ import pycolmap
 import pytest
 
 import hodge_pipeline
+from colmap_data import FREE, noisy
 from hodge_adapters.colmap.models import ColmapModels
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from readers_data import write_depth
-from test_refine_colmap import FREE, noisy
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
@@ -235,7 +235,7 @@ def test_a_real_model_of_red_kitchen(data_dir: Path, tmp_path: Path) -> None:
 
     from hodge_adapters.colmap.reader import ColmapReader
 
-    images = colour_images(data_dir / "seven_scenes/redkitchen/seq-01")[:40:5]
+    images = colour_images(data_dir / "seven_scenes/redkitchen/seq-01")[:30:5]
     assert make_model(images, tmp_path, (585, 585, 320, 240), features=1500) == 1
     theirs = pycolmap.Reconstruction(tmp_path / "sparse/0")
     ours = ColmapReader(edges="none", scale=1.0).open(tmp_path / "sparse/0")

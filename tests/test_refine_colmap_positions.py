@@ -10,6 +10,7 @@ import pycolmap
 import pytest
 
 import hodge_pipeline
+from colmap_data import FREE, noisy
 from hodge_adapters.colmap.bodies import bodies_of
 from hodge_adapters.colmap.content import content_of
 from hodge_adapters.colmap.models import ColmapModels
@@ -18,7 +19,6 @@ from hodge_adapters.colmap.resection import resected
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
-from test_refine_colmap import FREE, noisy
 
 WORLD_FROM_MODEL = pycolmap.Sim3d(
     2.5, pycolmap.Rotation3d(se3.so3_exp(np.array([0.3, -1.0, 0.5]))), np.array([10.0, 20.0, 3.0])

@@ -11,13 +11,13 @@ import pycolmap
 import pytest
 
 import hodge_pipeline
+from colmap_data import FREE, noisy
 from hodge_adapters.colmap import uncertainty
 from hodge_adapters.colmap.models import ColmapModels
 from hodge_adapters.colmap.uncertainty import standard_errors
 from hodge_pipeline import se3
 from hodge_pipeline.refine.reprojection_cost import best, costs, mends, spoilt_doubt
 from hodge_pipeline.types import ModelQuality
-from test_refine_colmap import FREE, noisy
 
 BEYOND_ANY_IMAGE_PX = 1e9
 Errors = dict[tuple[str, int], float]

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+from colmap_data import synthetic
 from hodge_pipeline import registry, testing
 from hodge_pipeline.testing.writers import whole_source
 from readers_data import seven_scenes_sequence
-from test_readers_colmap import synthetic
 
 OWN = "hodge-pipeline "
 PROPERTIES = {kind: check.properties for kind, check in testing.CHECKS.items() if kind != "readers"}

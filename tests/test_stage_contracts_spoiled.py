@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from colmap_data import synthetic
 from hodge_adapters.trajectories.readers import TumPosesReader
 from hodge_adapters.trajectories.text import TumWriter, parse_tum
 from hodge_pipeline import testing
@@ -37,7 +38,6 @@ from spoiled_stages import (
     without_guess,
 )
 from spoiled_writers import Models, Rewriter, Writer
-from test_readers_colmap import synthetic
 
 SPOILED = [
     ("edges", Changeable(), "is a stage", "can be changed"),
