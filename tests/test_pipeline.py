@@ -5,8 +5,7 @@ import json
 import os
 import shutil
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.registration import register
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.store import store
-from hodge_pipeline.types.notes import Note
+from stand_ins import Log
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 
 SMALL = (
@@ -53,23 +52,6 @@ def short_recipe(source: Path, *overrides: str) -> Recipe:
 @pytest.fixture(scope="module")
 def run(tiny_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:  # noqa: F811
     return hodge_pipeline.run(small_recipe(tiny_sequence), tmp_path_factory.mktemp("runs") / "tiny")
-
-
-class Log:
-    """A watcher that remembers which stages really ran, and may stop the run at one."""
-
-    def __init__(self, stop_at: str = "") -> None:
-        self.stop_at, self.stages, self.said = stop_at, list[str](), list[str]()
-
-    @contextmanager
-    def stage(self, title: str, total: int) -> Iterator[object]:
-        self.stages.append(title)
-        if title == self.stop_at:
-            raise KeyboardInterrupt
-        yield lambda done: None
-
-    def note(self, note: Note) -> None:
-        self.said.append(str(note))
 
 
 def test_a_run_leaves_what_a_person_can_open(run: Run) -> None:

@@ -29,8 +29,9 @@ from hodge_pipeline.store.store import stored
 from hodge_pipeline.types.ply import read_model
 from hodge_pipeline.uses.record_again import record_again
 from recording_data import rgb, rows
+from stand_ins import Log
 from synthetic import short_sequence  # noqa: F401 - a fixture
-from test_pipeline import SHORT, SMALL, Log, short_recipe
+from test_pipeline import SHORT, SMALL, short_recipe
 
 NORMAL = ("recording.level=normal",)
 

@@ -16,10 +16,10 @@ from hodge_pipeline.review.listing import Query, describe, list_edges, state
 from hodge_pipeline.review.opening import Review
 from hodge_pipeline.review.subject import open_for_review
 from hodge_pipeline.types import Source
+from review_data import PLANTED, graph_file  # noqa: F401 - a fixture
+from stand_ins import Log
 from synthetic import tiny_sequence  # noqa: F401 - a fixture
 from test_cli_edit import small_recipe
-from test_pipeline import Log
-from test_review import PLANTED, graph_file  # noqa: F401 - a fixture
 
 
 def test_a_second_review_of_the_same_graph_is_refused(graph_file: Path) -> None:  # noqa: F811

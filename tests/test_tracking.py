@@ -24,30 +24,24 @@ from hodge_pipeline.fusion.fuse import fuse_all
 from hodge_pipeline.pairs.edits import Edit, History, write_history
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.registration import tracking
-from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.focal import Focal
-from hodge_pipeline.registration.odometry import Odometry
 from hodge_pipeline.registration.readout import Readout
 from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
 from hodge_pipeline.registration.tracking import TrackingOptions, frame_blocks, track_block
 from hodge_pipeline.rounds.all_frames import pose_frames
-from hodge_pipeline.scene import KeyFrames, Round, Scene, key_source
-from hodge_pipeline.sources.opening import fingerprints, remembered
+from hodge_pipeline.scene import Scene, key_source
 from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.start import key_frames as tracked
-from hodge_pipeline.start import odometry as odometry_start
-from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.key_frames import KeyFrameStart, Tracked, followers
-from hodge_pipeline.start.odometry import OdometryStart
-from hodge_pipeline.start.unordered.join import _keeps_odometry
-from hodge_pipeline.start.unordered.start import Start
-from hodge_pipeline.store.store import Store, stored
-from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Source, ViewGraph
+from hodge_pipeline.store.store import stored
+from hodge_pipeline.types import Floats, Floats32, Frame, Source
 from hodge_pipeline.types.notes import Note
 from hodge_pipeline.uses.recipe_run import solve_again
-from test_pipeline import Log
+from stand_ins import Log, Told
 
 FRAMES, BLOCK, FUSED = 64, 48, "fusion=[cloud]"
+
+
 SMALL = (
     "clouds.voxel_m=0.06", "fusion=[]", "executor.workers=0", "recording.level=off", "evaluation.tables=false",
     "outer_iterations=1", "edges.max_edges_per_frame=4", "start.whole_up_to=20",
@@ -103,26 +97,6 @@ def track(source: Source, folder: Path, readout: Readout | None = None) -> tuple
 
 def all_poses(source: Source, found: Tracked, world_from_key: Floats) -> Floats:
     return followers(source, found).expand(world_from_key)
-
-
-class Told:
-    """Steps that compute nothing: they keep what they are asked for, and answer the same to all."""
-
-    def __init__(self, answer: object) -> None:
-        self.answer, self.asked = answer, list[tuple[Any, ...]]()
-
-    def step(self, *function_and_inputs: Any, **_: Any) -> Any:
-        self.asked.append(function_and_inputs)
-        return self.answer
-
-    def note(self, *notes: Note) -> None:
-        pass
-
-    def key(self, value: object) -> str:
-        return "key"
-
-    def remember(self, value: object, key: str) -> None:
-        pass
 
 
 def empty_depth(shape: tuple[int, int]) -> Floats32:
@@ -182,33 +156,6 @@ def test_after_an_edit_key_frames_alone_are_fused_and_it_is_said(
     again = hodge_pipeline.run(small_recipe(sequence, FUSED), folder)
     assert not any("key frames alone" in str(note) for note in again.report.notes)
     np.testing.assert_array_equal(again.result.world_from_cam, edited.result.world_from_cam)
-
-
-@pytest.mark.parametrize(("up_to", "apart_s", "whole"), [("12", 0.1, True), ("auto", 0.7, True), ("auto", 0.1, False)])
-def test_what_is_short_enough_is_registered_whole_unless_it_is_a_video(
-    sequence: Path, tmp_path: Path, up_to: str, apart_s: float, whole: bool
-) -> None:
-    recipe = small_recipe(sequence, f"start.whole_up_to={up_to}")
-    steps, reader = Store(tmp_path), TumReader()
-    opened = reader.open(sequence)
-    frames = tuple(replace(frame, stamp_s=1e9 + apart_s * row) for row, frame in enumerate(opened.frames[:12]))
-    source = remembered(replace(opened, frames=frames), reader, steps, fingerprints(opened.files))
-    scene = recipe.start.begin(source, recipe.clouds, steps, InProcess())
-    assert scene.key_frames.are_all == whole and (len(scene.clouds) == 12) == whole
-    assert len(scene.first.world_from_cam) == len(scene.clouds)
-
-
-@pytest.mark.parametrize(("up_to", "is_said"), [("auto", True), ("12", False)])
-def test_numbered_frames_that_are_not_tracked_are_said(
-    sequence: Path, tmp_path: Path, up_to: str, is_said: bool
-) -> None:
-    recipe = small_recipe(sequence, f"start.whole_up_to={up_to}")
-    steps, reader = Store(tmp_path), TumReader()
-    opened = reader.open(sequence)
-    frames = tuple(replace(frame, stamp_s=float(row)) for row, frame in enumerate(opened.frames[:12]))
-    source = remembered(replace(opened, frames=frames), reader, steps, fingerprints(opened.files))
-    recipe.start.begin(source, recipe.clouds, steps, InProcess())
-    assert any("12 frames are numbered, and nothing tells" in str(note) for note in steps.notes) == is_said
 
 
 def test_frames_follow_their_key_frames(sequence: Path, whole: Tracked) -> None:
@@ -301,8 +248,8 @@ def test_black_frames_of_a_kinect_end_no_worse_than_odometry(data_dir: Path, tmp
     recipe = load_recipe(
         "tum", ["executor.workers=0", "recording.level=off", "evaluation.tables=false", "fusion=[]"], path
     )
-    frames = list(TumReader().open(path).frames)
-    for row in range(25, 35):
+    frames = list(TumReader().open(path).frames[15:45])
+    for row in range(10, 20):
         frames[row] = replace(frames[row], read_colour=partial(np.zeros, (480, 640, 3), np.uint8))
     source = replace(TumReader().open(path), frames=tuple(frames))
     rows = {row.name: row for row in hodge_pipeline.run(recipe, tmp_path / "run", source=source).report.trajectories}
@@ -342,57 +289,6 @@ def test_frames_without_depth_are_bridged_and_said(
     assert empty <= {0, BLOCK, FRAMES - 1}  # the ends of blocks are key frames whatever they saw
     inside = [row for row in dark if dark[0] > 0 and dark[-1] < FRAMES - 1]
     assert all(np.linalg.norm(apart[row, :3, 3]) < 0.09 for row in inside)
-
-
-@pytest.mark.parametrize(
-    ("edges", "apart"),
-    [([[0, 1], [1, 2], [2, 3]], False), ([[0, 1], [2, 3]], True), ([[0, 1], [1, 2]], False)],  # the last: a lone frame
-)
-def test_relocalisation_is_automatic_where_odometry_left_parts(
-    edges: list[list[int]], apart: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    poses, source = np.tile(np.eye(4), (4, 1, 1)), source_at([0, 1, 2, 3])
-    graph = ViewGraph.from_edges(np.arange(4), np.array(edges), poses[: len(edges)])
-    joined = Round(Edges.of([]), graph.vertex_ids, poses, name="joined")
-    monkeypatch.setattr(odometry_start, "join_parts", lambda *_: joined)
-    found = Odometry(poses, Edges.measured(graph), ())
-    for relocalise, expected in (("auto", apart), (True, True), (False, False)):
-        scene = OdometryStart(relocalise=relocalise).joined(  # type: ignore[arg-type]
-            source, CloudSet.from_clouds([]), CloudOptions(), found, KeyFrames.all_of(source, poses), Told(None),
-            InProcess(),
-        )  # type: ignore[arg-type]  # fmt: skip
-        assert (scene.first is joined) == expected
-
-
-def test_landmarks_are_made_where_parts_are_joined_alone(tmp_path: Path) -> None:
-    reader = TumReader()
-    opened = reader.open(make_sequence(tmp_path / "demo", DemoOptions(frames=2, width=160, height=120)))
-    poses, edges = np.tile(np.eye(4), (2, 1, 1)), np.array([[0, 1]])
-    for pairs, expected in ((edges, False), (edges[:0], True)):
-        store, options = Store(tmp_path / f"store-{expected}"), CloudOptions()
-        source = remembered(opened, reader, store, fingerprints(opened.files))
-        found = Odometry(poses, Edges.measured(ViewGraph.from_edges(np.arange(2), pairs, poses[: len(pairs)])), ())
-        made = make_clouds(source, options, store, InProcess())
-        key_frames = KeyFrames.all_of(source, poses)
-        scene = OdometryStart(relocalise=expected).joined(source, made, options, found, key_frames, store, InProcess())
-        assert (len(scene.clouds.mark_points) > 0) == expected and len(scene.clouds) == 2
-        np.testing.assert_array_equal(scene.clouds.points, made.points)
-
-
-def source_at(stamps_s: list[float]) -> Source:
-    return Source("four", Path("four"), tuple(Frame(row, stamp_s) for row, stamp_s in enumerate(stamps_s)))
-
-
-def test_parts_that_nothing_joins_stay_where_they_are_guessed_to_be_unless_over_a_hole() -> None:
-    edges, poses = np.array([[0, 1], [2, 3]]), np.broadcast_to(np.eye(4), (4, 4, 4))
-    graph = ViewGraph.from_edges(np.arange(4), edges, poses[:2])
-    known = Edges.measured(graph)
-    apart = Start(poses, known, np.array([0, 0, 1, 1]), ())
-    joined = Start(poses, known, np.zeros(4, np.int64), ())
-    steady, hole = source_at([0, 1, 2, 3]), source_at([0, 1, 2, 30])
-    assert _keeps_odometry(steady, known, apart)
-    assert not _keeps_odometry(steady, known, joined)
-    assert not _keeps_odometry(hole, known, apart)
 
 
 @pytest.mark.parametrize("earlier", [False, True])
