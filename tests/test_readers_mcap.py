@@ -17,6 +17,13 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Camera, Frame
 from mcap_data import (
+    CALIBRATION,
+    COLOUR,
+    COMPRESSED,
+    DEPTH,
+    INFO,
+    OPTICAL,
+    RAW,
     SECOND,
     Log,
     calibration,
@@ -33,11 +40,6 @@ from mcap_data import (
 from mcap_encoding import CDR, ENCODINGS, JSON, PROTOBUF
 from readers_data import HEIGHT, WIDTH, depth_values
 from synthetic import tiny_sequence  # noqa: F401
-
-RAW, COMPRESSED, CALIBRATION = "foxglove.RawImage", "foxglove.CompressedImage", "foxglove.CameraCalibration"
-DEPTH, COLOUR, INFO = "/cam/depth/image", "/cam/color/image", "/cam/depth/camera_info"
-OPTICAL = "cam_optical"
-CAMERA = Camera(WIDTH, HEIGHT, 10, 11, 4, 3)
 
 
 def stored(frame: Frame, units_per_metre: float) -> np.ndarray:

@@ -12,16 +12,22 @@ from mcap.writer import CompressionType, IndexType
 from hodge_adapters.mcap.reader import McapReader
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.testing import check_reader
-from hodge_pipeline.types import Camera
-from mcap_data import Log, calibration, depth_log, foxglove_header, some_images, write_depth_log
+from mcap_data import (
+    CALIBRATION,
+    DEPTH,
+    INFO,
+    OPTICAL,
+    RAW,
+    Log,
+    calibration,
+    depth_log,
+    foxglove_header,
+    some_images,
+    write_depth_log,
+)
 from mcap_encoding import CDR, PROTOBUF
 from readers_data import HEIGHT, WIDTH, depth_values
 from synthetic import tiny_sequence  # noqa: F401
-
-RAW, COMPRESSED, CALIBRATION = "foxglove.RawImage", "foxglove.CompressedImage", "foxglove.CameraCalibration"
-DEPTH, COLOUR, INFO = "/cam/depth/image", "/cam/color/image", "/cam/depth/camera_info"
-OPTICAL = "cam_optical"
-CAMERA = Camera(WIDTH, HEIGHT, 10, 11, 4, 3)
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))

@@ -9,8 +9,10 @@ from hodge_adapters.mcap.reader import McapReader
 from hodge_pipeline import se3
 from hodge_pipeline.sources.inspect import inspect
 from hodge_pipeline.testing import check_reader
-from hodge_pipeline.types import Camera, Floats
+from hodge_pipeline.types import Floats
 from mcap_data import (
+    COLOUR,
+    OPTICAL,
     SECOND,
     Log,
     depth_log,
@@ -25,11 +27,6 @@ from mcap_data import (
 from mcap_encoding import CDR, ENCODINGS, PROTOBUF
 from readers_data import HEIGHT, WIDTH, some_poses
 from synthetic import tiny_sequence  # noqa: F401
-
-RAW, COMPRESSED, CALIBRATION = "foxglove.RawImage", "foxglove.CompressedImage", "foxglove.CameraCalibration"
-DEPTH, COLOUR, INFO = "/cam/depth/image", "/cam/color/image", "/cam/depth/camera_info"
-OPTICAL = "cam_optical"
-CAMERA = Camera(WIDTH, HEIGHT, 10, 11, 4, 3)
 
 
 def camera_on_body() -> Floats:
