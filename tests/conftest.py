@@ -53,9 +53,11 @@ def data_dir() -> Path:
 
 
 LONGEST = (
-    "review_browser", "backbone", "pipeline", "stage_contracts", "lidar", "faults", "tracking", "solver_robust",
-    "refine_trajectory", "refined_trajectory", "recording_run", "never_worse", "diagnosis_real_data", "notebooks",
-    "recipe_mcap", "new_plugin", "backbone_breaks", "refine_colmap", "golden", "fitted_camera", "two_hosts", "docs",
+    "review_browser", "stage_contracts", "tracking", "backbone_doubted", "lidar", "never_worse", "solver_robust",
+    "backbone", "backbone_places", "faults", "backbone_breaks", "refine_colmap_joins", "sweeps", "refine_trajectory",
+    "run_folder", "pipeline", "suggested_rounds", "fitted_camera", "executors", "refine_colmap", "golden", "notebooks",
+    "two_hosts", "moving", "backbone_trust", "backbone_window", "cli_edit", "backbone_sessions", "new_plugin",
+    "refined_trajectory", "recording_run", "recipe_mcap", "diagnosis_real_data", "docs",
 )  # fmt: skip
 """Files that take longest: begun last, one would keep a processor alone."""
 
