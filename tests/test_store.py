@@ -314,6 +314,28 @@ def test_shared_pages_of_workers_are_counted_again_only_when_memory_has_grown(mo
     assert [*peaks, spent.peak_mb] == [50.0, 50.5, 100.0, 40.0, 40.0] and len(looks) == 4
 
 
+def test_a_stage_looks_at_all_processes_once_and_counts_those_that_began_in_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """At its end: it begins with those that the last one ended with."""
+    looks, worker = list[int](), cost_module.psutil.Process(1)
+    spent_s = dict.fromkeys((os.getpid(), worker.pid), 0.0)
+    monkeypatch.setattr(cost_module, "SAMPLE_SECONDS", 1e6)
+    monkeypatch.setattr(
+        cost_module.psutil.Process, "cpu_times", lambda one: SimpleNamespace(user=spent_s[one.pid], system=0)
+    )
+    monkeypatch.setattr(
+        cost_module.psutil.Process, "children", lambda one, recursive: looks.append(one.pid) or [worker]
+    )
+    monitor = cost_module.Monitor()
+    for in_stage, between in ((2.0, 3.0), (5.0, 0.0)):
+        with monitor.measure() as cost:
+            spent_s[worker.pid] += in_stage
+        assert cost.cpu_s == in_stage
+        spent_s[worker.pid] += between
+    assert len(looks) == 2
+
+
 VALUES: list[tuple[Any, Any]] = [
     (Value(np.nan, None, {}), Value),
     (Value(-np.inf, Inner(ONE, None), {"a b": ONE[:0]}, b"\x00\xff", (Inner(ONE, "é", ("x",)),), (1, "q")), Value),
