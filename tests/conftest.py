@@ -133,7 +133,7 @@ def kind_of(data: object) -> object:
         known = data[np.isfinite(data)] if data.dtype.kind in "iuf" else data
         return shape, min(known.size, 2), known.size == data.size, bool(known.size and (known == known.flat[0]).all())
     if isinstance(data, (bool, str)):
-        return data
+        return bool(data)
     if isinstance(data, (list, tuple, dict)):
         named = dict(enumerate(data)) if isinstance(data, (list, tuple)) else data
         return sorted({repr((name if isinstance(name, str) else "", kind_of(one))) for name, one in named.items()})
