@@ -10,6 +10,7 @@ import atexit
 import gc
 import hashlib
 import os
+import pickle
 import shutil
 import sys
 import tempfile
@@ -91,7 +92,7 @@ _textures: dict[str, object] = {}
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """Every plot is drawn in tests that are marked `draws`, and elsewhere the first of a kind of data.
 
-    They are half of what a small run costs, and gaps between the points of pictures, which stay open, a tenth.
+    So are pictures of scenes. All are a fifth of what a small run costs; gaps between points, which stay open, a tenth.
     A run waits for the disk 200 times, which costs a tenth too and tells nothing while the power stays on.
     """
     with pytest.MonkeyPatch.context() as patch:
@@ -104,22 +105,36 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
 
 def draw_once(patch: pytest.MonkeyPatch, folder: Path) -> None:
-    """Keep the first plot of each kind of data in the folder, for all that come later."""
-    from hodge_pipeline.report import diagnosis_plots, edge_pictures, painting, plots
+    """Keep the first plot, and the first pictures of a scene, of each kind of data for all that come later."""
+    from hodge_pipeline.report import diagnosis_plots, edge_pictures, painting, plots, run_report
     from hodge_pipeline.report.document import Picture
 
     paint_it = painting.painted
 
     def painted(title: str, caption: str, paint: Callable[[Any], None]) -> Picture:
-        data = [kind_of(cell.cell_contents) for cell in paint.__closure__ or ()]
-        kept = folder / f"drawn-{hashlib.sha256(repr((title, data)).encode()).hexdigest()[:16]}.png"
-        if not kept.exists():
-            (draft := kept.with_suffix(f".{os.getpid()}")).write_bytes(paint_it(title, caption, paint).image)
-            draft.rename(kept)
-        return Picture(title, caption, kept.read_bytes())
+        data = [cell.cell_contents for cell in paint.__closure__ or ()]
+        return Picture(title, caption, made_once(folder, (title, data), lambda: paint_it(title, caption, paint).image))
+
+    def seen(show: Callable[..., Any]) -> Callable[..., Any]:
+        def shown(clouds: Any, *inputs: Any) -> Any:
+            return made_once(folder, (show.__name__, clouds.sizes > 0, inputs), lambda: show(clouds, *inputs))
+
+        return shown
 
     for module in (diagnosis_plots, edge_pictures, painting, plots):
         patch.setattr(module, "painted", painted)
+    for show in (run_report.changed_most, run_report.four_sides):
+        patch.setattr(run_report, show.__name__, seen(show))
+
+
+def made_once(folder: Path, data: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+    """What was made of data of this kind first."""
+    name = hashlib.sha256(repr((data[0], kind_of(data[1:]))).encode()).hexdigest()[:16]
+    kept = folder / f"drawn-{name}.pickle"
+    if not kept.exists():
+        (draft := kept.with_suffix(f".{os.getpid()}")).write_bytes(pickle.dumps(make()))
+        draft.rename(kept)
+    return pickle.loads(kept.read_bytes())
 
 
 def kind_of(data: object) -> object:
