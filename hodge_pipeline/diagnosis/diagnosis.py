@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from hodge_pipeline.diagnosis.shared_blame import share_blame
 from hodge_pipeline.diagnosis.wording import reasons
 from hodge_pipeline.one_blas_thread import one_blas_thread
 from hodge_pipeline.solvers.backbone.chain import vertex_ranks
-from hodge_pipeline.solvers.backbone.lattice import lattice_backbone
+from hodge_pipeline.solvers.backbone.lattice import lattice_backbone, steps_are_wrong
 from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
 from hodge_pipeline.solvers.resistance import Network
 from hodge_pipeline.solvers.weights import OUT_OF_PLANE, dimension_of
@@ -61,10 +61,16 @@ def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbo
     graph = replace(graph, dimension=dimension_of(graph))
     if options.trust == AUTO and every_pair_tried(vertex_ranks(graph)[graph.edges], graph.vertex_count):
         return _ByCycles.of(graph, options).found
-    backbone = find_backbone(graph, options.trust, most_breaks=options.most_breaks)
+    by_cycles = cache(partial(_ByCycles.of, graph, options))  # slow, and not every graph needs it
+
+    def is_lattice(loops: Ints) -> bool:
+        judged = by_cycles()
+        return not judged.by_chance and steps_are_wrong(graph, judged.found.kept, loops)
+
+    backbone = find_backbone(graph, options.trust, most_breaks=options.most_breaks, is_lattice=is_lattice)
     if backbone is not None and not backbone.doubted:
         return backbone
-    judged = _ByCycles.of(graph, options)
+    judged = by_cycles()
     if options.trust != AUTO or not graph.edge_count:
         return judged.found
     if judged.by_chance:

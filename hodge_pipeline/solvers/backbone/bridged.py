@@ -54,12 +54,17 @@ that of a normal distribution.
 
 
 def infer_bridged(
-    chain: Chain, trusted: Bools, may_thin: bool, most: int = MOST_BREAKS
+    chain: Chain,
+    trusted: Bools,
+    may_thin: bool,
+    most: int = MOST_BREAKS,
+    is_sought: Callable[[Inferred], bool] = lambda unbroken: True,
 ) -> tuple[Chain, Inferred] | None:
     """The chain with its paths joined and up to `most` broken steps bridged, and its loops judged; None as in `infer`.
 
     A step is tried where loops of several places agree that it is broken, or where it is unlike all others. It is
-    broken where all loops are likelier with a bridge in its place: by more than chance would have them be.
+    broken where all loops are likelier with a bridge in its place: by more than chance would have them be. `is_sought`:
+    whether breaks should be sought, by the loops judged without any.
     """
     chain = unbroken = joined(chain)
     outliers = OutlierModel.of(chain, chain.poses)  # one for all trials, which makes their evidence comparable
@@ -71,7 +76,7 @@ def infer_bridged(
     if as_stated is not None and _believed(as_stated, first):
         first, as_stated = as_stated, None
     found = first
-    for _ in range(most):
+    for _ in range(most if most and is_sought(first) else 0):
         better = _better(chain, found, as_stated, judge)
         if better is None:
             break

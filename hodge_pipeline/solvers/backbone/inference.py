@@ -211,6 +211,8 @@ class _Trial:
             linear = fit.linear
             judged = judge(linear, fit, shares, self.outliers)
             shares, likelihood = mixture(judged.factor)
+            if likelihood < top - BY_CHANCE:  # wrong loops bend the poses, more in each round
+                break
             if likelihood > top:
                 best, top = (judged, linear), likelihood
             used = (judged.log_odds > 0) & (judged.factor > 0) | self.trusted

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from hodge_pipeline.solvers.backbone.step_tests import is_tested, left_out_steps
+from hodge_pipeline.solvers.backbone.step_tests import StepCounts, is_tested, left_out_steps
 from hodge_pipeline.solvers.backbone.trust import FEW_BREAKS, Backbone, find_backbone
-from hodge_pipeline.types import Bools, ViewGraph
+from hodge_pipeline.types import Bools, Ints, ViewGraph
 
 UNCONTRADICTED = 0.2
 """Share of the steps left out that no near loop contradicts, from which on groups of wrong loops are suspected: a step
@@ -27,6 +27,24 @@ mistaken in one way; there the backbone was nearer to the truth in 24. In lattic
 """
 
 
+def steps_are_wrong(graph: ViewGraph, kept: Bools, loops: Ints) -> bool:
+    """Whether the edges `kept (E,)` without a backbone explain more than it, so that its breaks need not be sought.
+
+    They have all `loops (K,)` that confirm it, and leave out `FEW_BREAKS` or more steps, which near loops contradict.
+    """
+    found = left_out_steps(graph, kept)
+    explained = bool(kept[loops].all()) and found.left_out >= FEW_BREAKS
+    return explained and not _is_rival(found) and not _too_many(found)
+
+
+def _is_rival(found: StepCounts) -> bool:
+    return found.uncontradicted >= max(UNCONTRADICTED * found.left_out, 1)
+
+
+def _too_many(found: StepCounts) -> bool:
+    return found.left_out > MOST_LEFT_OUT * found.steps
+
+
 def lattice_backbone(graph: ViewGraph, kept: Bools, doubted: Backbone | None = None) -> tuple[Backbone | None, bool]:
     """The backbone of a lattice or a room if it rivals the edges `kept (E,)` without one, else None; and whether it
     explains more than these: it confirms loops of more places, or few places speak against it.
@@ -36,15 +54,14 @@ def lattice_backbone(graph: ViewGraph, kept: Bools, doubted: Backbone | None = N
     """
     if doubted is not None and _explains_enough(doubted, kept):
         return doubted, True
-    uncontradicted, left_out, steps = left_out_steps(graph, kept)
-    too_many = doubted is not None and left_out > MOST_LEFT_OUT * steps
-    if uncontradicted < max(UNCONTRADICTED * left_out, 1) and not too_many:
+    found = left_out_steps(graph, kept)
+    if not _is_rival(found) and not (doubted is not None and _too_many(found)):
         return None, False
     backbone = doubted or find_backbone(graph, in_lattice=True)
     if backbone is None:
         return None, False
     for_it, against = backbone.places(backbone.used & ~kept), backbone.places(kept & ~backbone.used)
-    if (doubted or not backbone.found.confirmed) and against < PLACES_PER_WRONG_STEP * left_out:
+    if (doubted or not backbone.found.confirmed) and against < PLACES_PER_WRONG_STEP * found.left_out:
         return backbone, True
     weight = PLACES_PER_WRONG_STEP if is_tested(backbone.chain) else 1.0
     return backbone, backbone.found.confirmed and weight * for_it > against

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -124,7 +125,12 @@ class Backbone:
 
 
 def find_backbone(
-    graph: ViewGraph, trust: str = AUTO, *, in_lattice: bool = False, most_breaks: int = MOST_BREAKS
+    graph: ViewGraph,
+    trust: str = AUTO,
+    *,
+    in_lattice: bool = False,
+    most_breaks: int = MOST_BREAKS,
+    is_lattice: Callable[[Ints], bool] = lambda loops: False,
 ) -> Backbone | None:
     """The backbone of a graph; None where it has none that should be trusted.
 
@@ -132,6 +138,8 @@ def find_backbone(
       room are not; `sequential` trusts them, `none` no edge; any other word the edges of that `source`.
     - `in_lattice`: the backbone, without breaks, of a lattice or a room, and None elsewhere.
     - `most_breaks`: steps that loops may call wrong.
+    - `is_lattice`: asked where loops are many and the backbone without breaks is in doubt, with the loops (K,) that it
+      uses; if so, no breaks are sought.
 
     Raises `GraphError` where there are no such edges.
     """
@@ -145,14 +153,18 @@ def find_backbone(
         repeats &= np.isin(pair, pair[_in_order(graph, repeats)])
     single = loops_once(fused(graph, repeats), ~chosen) if chosen.any() else fused(graph, repeats)
     single = windowed(single) if trust in (AUTO, SEQUENTIAL) else single
-    backbone = _of_single_steps(single.graph, trust, in_lattice, most_breaks)
+    backbone = _of_single_steps(
+        single.graph, trust, in_lattice, most_breaks, lambda loops: is_lattice(single.rows[loops])
+    )
     if backbone is None:
         return None
     named = backbone.named if trust in (AUTO, SEQUENTIAL) else f"edges of {trust}"
     return _of_all_edges(graph, replace(backbone, named=named), single)
 
 
-def _of_single_steps(graph: ViewGraph, trust: str, in_lattice: bool, most_breaks: int) -> Backbone | None:
+def _of_single_steps(
+    graph: ViewGraph, trust: str, in_lattice: bool, most_breaks: int, is_lattice: Callable[[Ints], bool]
+) -> Backbone | None:
     """The backbone of a graph with one edge for each step: see `find_backbone`."""
     chosen = sequential_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
     if trust == AUTO and chosen.sum() < max(FEWEST_STEPS, COVERED * graph.vertex_count):
@@ -171,13 +183,25 @@ def _of_single_steps(graph: ViewGraph, trust: str, in_lattice: bool, most_breaks
         return None
     trusted = chosen[chain.loop_edge]  # edges of a trusted source that are in no path
     most = 0 if in_lattice else min(most_breaks, FEW_BREAKS if many_loops else MOST_BREAKS)
-    inferred = infer_bridged(chain, trusted, in_lattice or not many_loops, most)
+
+    def is_doubted(found: Inferred) -> bool:
+        chain = found.start.chain
+        agree = agreeing_loops(chain, ~found.used)
+        return bool(chain.broken.sum() >= FEW_BREAKS or agree > AGREEING_REFUSED * steps.sum())
+
+    inferred = infer_bridged(
+        chain,
+        trusted,
+        may_thin=in_lattice or not many_loops,
+        most=most,
+        is_sought=lambda unbroken: (
+            not (many_loops and is_doubted(unbroken) and is_lattice(chain.loop_edge[unbroken.used]))
+        ),
+    )
     if inferred is None:
         return None
     chain, found = inferred
-    broken = chain.broken.sum() >= FEW_BREAKS
-    agree = agreeing_loops(found.scales.applied(chain), ~found.used) if many_loops else 0
-    doubted = many_loops and bool(broken or agree > AGREEING_REFUSED * steps.sum())
+    doubted = many_loops and is_doubted(found)
     if in_lattice or len(found.reduced.active) >= found.used.sum():
         return _backbone(graph, chain, found, found.polished, steps, doubted)
     never_wrong = steps.copy()
