@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
+from benchmarks.wrong_loops import lattice_cases
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.types import ViewGraph
+from hodge_pipeline.solvers.backbone import bridged, inference
+from hodge_pipeline.types import Floats, ViewGraph
 from tests.backbone_graphs import Drive, at_one_place, broken, drive, round_trip
 from tests.test_backbone import NEVER_WORSE
 
@@ -110,3 +114,36 @@ def test_a_fifth_of_the_edges_of_a_lattice_are_wrong() -> None:
     found = diagnose(made.graph)
     assert made.error_m(found.world_from_cam) < 1.0
     assert (found.kept & wrong).sum() <= 5
+
+
+def test_breaks_are_not_sought_where_cycles_explain_all_and_many_steps_are_wrong(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It took seven times as long as all else, for a backbone that gave way to the cycles."""
+    case = next(case for case in lattice_cases(1) if case.name == "cylinder of 200, 5% wrong")
+    sought = Mock()
+    monkeypatch.setattr(bridged, "_better", sought)
+    np.testing.assert_array_equal(diagnose(case.graph).kept, case.right)
+    sought.assert_not_called()
+
+
+def test_poses_are_not_followed_to_where_loops_are_less_likely(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In Manhattan's graph with 500 wrong loops each further round took longer and led farther away."""
+    rounds = list[list[float]]()
+    agreed, mixture = inference._Trial.agreed, inference.mixture
+
+    def told(factor: Floats) -> tuple[Floats, float]:
+        found = mixture(factor)
+        rounds[-1].append(found[1])
+        return found
+
+    def followed(trial: inference._Trial, *inputs: Any) -> Any:
+        rounds.append([])
+        with monkeypatch.context() as patch:
+            patch.setattr(inference, "mixture", told)
+            return agreed(trial, *inputs)
+
+    monkeypatch.setattr(inference._Trial, "agreed", followed)
+    diagnose(drive(seed=0, world="corridor", count=150, loops=100, wrong=0.8, in_groups=True).graph)
+    falls = [[each < max(row) - inference.BY_CHANCE for each in row] for row in rounds]
+    assert any(row[-1] for row in falls) and not any(fell for row in falls for fell in row[:-1])
