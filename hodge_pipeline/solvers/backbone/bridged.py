@@ -118,7 +118,7 @@ def _as_stated(chain: Chain, found: Inferred, judge: Callable[..., Inferred | No
     motion like larger errors of all loops.
     """
     scales = found.scales.at_most_stated if chain.stated else Scales()
-    larger = chain.stated and (found.scales.prior_cost() > 0 or found.scales.loops_surprise)
+    larger = chain.stated and (found.scales.steps_surprise or found.scales.loops_surprise)
     return judge(chain, scales=scales) if found.scales != scales and (larger or not found.confirmed) else None
 
 

@@ -354,16 +354,16 @@ def one_of_each_place(ends: Floats) -> Ints:
 
 def corridors(ends: Floats) -> Ints:
     """The corridor (K,) of each loop: a run of adjacent places, cut to `LONGEST_CORRIDOR`; `ends (K, 2)` in places."""
-    adjacent = cKDTree(ends).query_pairs(ADJACENT, p=np.inf, output_type="ndarray")
-    run = connected_components(adjacent, len(ends))
-    part, after = np.empty_like(run), 0
-    for number in range(run.max(initial=-1) + 1):
-        rows = np.flatnonzero(run == number)
-        along = ends[rows, np.ptp(ends[rows], axis=0).argmax()]
-        at = ((along - along.min()) / LONGEST_CORRIDOR).astype(np.int64)
-        part[rows] = after + np.unique(at, return_inverse=True)[1]
-        after = int(part[rows].max()) + 1
-    return part
+    if not len(ends):
+        return np.zeros(0, np.int64)
+    run = connected_components(cKDTree(ends).query_pairs(ADJACENT, p=np.inf, output_type="ndarray"), len(ends))
+    order = np.argsort(run, kind="stable")
+    first = np.unique(run[order], return_index=True)[1]
+    low, high = (reduce.reduceat(ends[order], first) for reduce in (np.minimum, np.maximum))
+    axis = (high - low).argmax(axis=1)[run]
+    along = ends[np.arange(len(ends)), axis] - low[run, axis]
+    parts = np.stack([run, (along / LONGEST_CORRIDOR).astype(np.int64)], axis=1)
+    return np.unique(parts, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 ADJACENT = 2.0

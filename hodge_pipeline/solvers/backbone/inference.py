@@ -72,13 +72,15 @@ def infer(
 @dataclass(frozen=True)
 class _Rated:
     """All loops at some poses: their log-likelihood, each place counting once; the `score (M,)` of each, the lesser of
-    its log-odds and its log Bayes factor; the shares (2,) of right and wrong ones; and the chain there.
+    its log-odds and its log Bayes factor; the shares (2,) of right and wrong ones; the chain there; and whether some of
+    the used loops alone led there: another choice of them changes the likelihood by more than one place does.
     """
 
     likelihood: float
     score: Floats
     shares: Floats
     linear: Linear
+    is_thinned: bool
 
 
 @dataclass(frozen=True)
@@ -141,8 +143,8 @@ class _Trial:
 
     def grown(self) -> tuple[Bools, _Rated] | None:
         """Loops (M,) to begin with, and all loops at their poses: the strongest alone, then in rounds those that stand
-        out at the new poses. Where none does, one place is added, that of a few with which all loops are likeliest,
-        while their likelihood rises.
+        out at the new poses. Where none does, and not so many are used that some must do for all, one place is added,
+        that of a few with which all loops are likeliest, while their likelihood rises.
 
         Weak loops may be wrong in one way together and, taken all at once, bend the poses until right ones do not fit.
         """
@@ -158,6 +160,8 @@ class _Trial:
             if not number or used.sum() > before.sum():
                 found = self.rated(used, rated.linear, rated.shares)
                 continue
+            if rated.is_thinned:
+                break
             each = [(more, self.rated(more, rated.linear, rated.shares)) for more in self.with_one_place(used, rated)]
             best = used, rated
             for more, other in each:
@@ -190,7 +194,8 @@ class _Trial:
         judged = judge(fit.linear, fit, shares, self.outliers)
         shares, _ = mixture(judged.factor)
         each = np.logaddexp(np.log(shares[0]) + judged.factor, np.log(shares[1]))
-        return _Rated(float(self.place_share @ each), np.minimum(judged.factor, judged.log_odds), shares, fit.linear)
+        likelihood, score = float(self.place_share @ each), np.minimum(judged.factor, judged.log_odds)
+        return _Rated(likelihood, score, shares, fit.linear, is_thinned=len(reduced.active) < len(rows))
 
     def agreed(self, used: Bools, shares: Floats, linear: Linear) -> tuple[Bools, Judged, Linear] | None:
         """Loops (M,) that agree with the poses that they lead to, iterated from those `used (M,)` on; how all are

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.special import pdtrc
+from scipy.special import gammaln, pdtrc
 
 from hodge_pipeline.solvers.backbone.breaks import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.chain import corridors, loops_at_place, one_of_each_place
@@ -50,11 +50,21 @@ MOST_PAIRS = 200_000
 
 @dataclass(frozen=True)
 class Arrangement:
-    """Places assumed right (K,), the fit with one loop of each, and the log-odds of this assumption."""
+    """Places assumed right (K,), the fit with one loop of each, and the log-odds of this assumption.
+
+    - `log_ways`: n of N places can be mistaken in about N^n / n! ways, of which `log_odds` count N^n. These compare
+      changes of one place; whether the places are right at all is for `of_all` to say.
+    """
 
     right: Bools
     fit: Fit
     log_odds: float
+    log_ways: float
+
+    @property
+    def of_all(self) -> float:
+        """The log-odds that all are right, against as many mistaken ones."""
+        return self.log_odds + self.log_ways
 
 
 @dataclass(frozen=True)
@@ -139,7 +149,8 @@ class Places:
         active = np.searchsorted(self.loop, fit.reduced.active)
         # without rivals MISTAKEN_PLACES counts once, not for each place
         prior = max(len(active) - 1, 0) * float(np.log(MISTAKEN_PLACES)) - float(self.rivals(right)[active].sum())
-        return Arrangement(right, fit, self._density(fit) + prior)
+        n = len(active) - np.searchsorted(np.sort(self.size[active]), self.size[active])  # that have as many loops
+        return Arrangement(right, fit, self._density(fit) + prior, float((gammaln(n + 1) / n).sum()))
 
     def _density(self, fit: Fit) -> float:
         """The log-density of all active loops, against all being wrong: one Student's t for all, since all errors may
@@ -158,10 +169,10 @@ class Places:
         are not `enough`, from the place with the strongest evidence; and whether its log-odds are enough.
         """
         found = self._improved(self.arranged(self.used, linear))
-        if found.log_odds <= enough:
+        if found.of_all <= enough:
             other = self._improved(self.arranged(self._agreeing_with_strongest(enough), self.start))
-            found = max(found, other, key=lambda each: each.log_odds)
-        return found, found.log_odds > enough
+            found = max(found, other, key=lambda each: each.of_all)
+        return found, found.of_all > enough
 
     def _agreeing_with_strongest(self, enough: float) -> Bools:
         """The place with the strongest evidence by itself, and those (K,) that agree with it and each other."""

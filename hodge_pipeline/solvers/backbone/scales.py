@@ -30,6 +30,8 @@ LIKELIER_BY = float(np.log(100.0))
 """Nats that a further start must gain over the stated scale."""
 DECOYS = 4
 """Decoys per loop: with one, scales of loops differed up to eightfold from one draw to the next."""
+SURPRISING = 2.5
+"""Learned scale of steps that tells something: right loops of 288 walks that err as stated ask for up to 2."""
 MOST_LOOPS = 3000
 """Loops that scales are learned from: more hardly change them."""
 
@@ -62,6 +64,16 @@ class Scales:
     def at_most_stated(self) -> Scales:
         """Those of these scales that are below 1, the others 1."""
         return Scales(*(min(each, 1.0) for each in astuple(self)))
+
+    @property
+    def of_steps(self) -> float:
+        """The larger scale of steps."""
+        return max(self.step_turn, self.step_shift)
+
+    @property
+    def steps_surprise(self) -> bool:
+        """Whether steps err by over `SURPRISING` times what they state."""
+        return self.of_steps > SURPRISING
 
     @property
     def loops_surprise(self) -> bool:

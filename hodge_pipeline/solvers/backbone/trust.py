@@ -114,11 +114,11 @@ class Backbone:
             return f"{trusted}, {counted(loops, 'loop')} that nothing confirms: the poses are the backbone's"
         broken = int((self.steps & ~self.used).sum())
         called_wrong = f", {broken} of them called wrong by the others or the loops" if broken else ""
-        larger = max(self.found.scales.step_turn, self.found.scales.step_shift)
+        scales = self.found.scales
         if not self.chain.stated:
             errors = "; errors as loops show them, since the information lacks some"
-        elif larger > SURPRISING:
-            errors = f"; these edges then err {larger:.2g} times what they state, or the loops are wrong alike"
+        elif scales.steps_surprise:
+            errors = f"; these edges then err {scales.of_steps:.2g} times what they state, or the loops are wrong alike"
         else:
             errors = ""
         return f"{trusted}{called_wrong}, {used} of {loops} loops confirmed{errors}"
@@ -311,8 +311,5 @@ def of_every_loop(graph: ViewGraph, backbone: Backbone, trusted: Bools) -> Backb
 
 MOST_SOLVED, TOLERANCE = 5, 1e-4
 """Reweighted solves, each in seconds for 100,000 edges; and the relative tolerance of χ²."""
-SURPRISING = 2.5
-"""Learned scale of steps from which the note reports it. Right loops of 288 walks that err as stated ask for up to 2.
-"""
 UNUSED = 0.49
 """Largest probability that is reported of an unused loop."""
