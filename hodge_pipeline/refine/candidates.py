@@ -14,8 +14,9 @@ from hodge_pipeline.refine.model_edges import DepthEdges, depth_edges, no_depth_
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_solve import Solved, position_priors, solve_bodies
 from hodge_pipeline.refine.reprojection_cost import SAME_COST, ReprojectionCost, best, costs
-from hodge_pipeline.stages import Step, Steps, TrackedModel, Workers
+from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.types import Bools, Floats, PositionPriors, ViewGraph
+from hodge_pipeline.types.tracked_model import TrackedModel
 
 MODEL = "model"
 GIVEN, POINTS, ADJUSTED = "as given", "bundle adjustment of points alone", "bundle adjustment"

@@ -14,8 +14,9 @@ from hodge_pipeline.refine.candidates import CandidateSet
 from hodge_pipeline.refine.guard import SCORE_TOLERANCE, Measure
 from hodge_pipeline.refine.reprojection_cost import ENOUGH_SEEN, best, degrees_of_freedom, mends
 from hodge_pipeline.refine.uncertainty import told_apart
-from hodge_pipeline.stages import Adjusted, Step, Steps, TrackedModel
+from hodge_pipeline.stages import Step, Steps
 from hodge_pipeline.types import Floats
+from hodge_pipeline.types.tracked_model import Adjusted, TrackedModel
 
 FINEST_PX = 0.01
 """Mean reprojection error below which the input is kept: no detector locates keypoints better."""

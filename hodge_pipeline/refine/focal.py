@@ -8,7 +8,8 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.difference import alike
 from hodge_pipeline.refine.candidates import CandidateSet, adjusted_model
 from hodge_pipeline.refine.reprojection_cost import ENOUGH_SEEN, costs, degrees_of_freedom
-from hodge_pipeline.stages import Steps, TrackedModel
+from hodge_pipeline.stages import Steps
+from hodge_pipeline.types.tracked_model import TrackedModel
 
 FREE: dict[Literal["rig", "focal", "all"], tuple[str, str, float]] = {
     "rig": ("the rig's calibration", "bundle adjustment with free rigs", 0.05),

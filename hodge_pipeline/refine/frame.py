@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hodge_pipeline.evaluation.trajectory import align
-from hodge_pipeline.stages import TrackedModel
+from hodge_pipeline.types.tracked_model import TrackedModel
 
 ROUNDS, MEDIANS = 10, 3.0
 """Fits of the frame, and the medians of the distances within which bodies take part: Gaussian noise leaves out one of

@@ -23,9 +23,10 @@ from hodge_pipeline.refine.pieces import pieces_doubt
 from hodge_pipeline.refine.reprojection_cost import SAME_COST, ReprojectionCost, named, spoilt_doubt
 from hodge_pipeline.refine.scale import Scale, metric_scale
 from hodge_pipeline.refine.uncertainty import SIGMAS, loose, moves
-from hodge_pipeline.stages import Steps, TrackedModel, Workers
+from hodge_pipeline.stages import Steps, Workers
 from hodge_pipeline.types import Floats
 from hodge_pipeline.types.arrays import rms
+from hodge_pipeline.types.tracked_model import TrackedModel
 
 NO_OBSERVATION = (
     "the model has no point that two images saw: nothing tells good poses from bad: triangulate points first"

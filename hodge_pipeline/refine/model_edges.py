@@ -12,10 +12,11 @@ from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.registration.cloud_set import prepare_clouds
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.register import register_edges
-from hodge_pipeline.stages import Step, Steps, TrackedModel, Workers
+from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.store.codec import CLOUDS
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, ViewGraph
 from hodge_pipeline.types.text import counted
+from hodge_pipeline.types.tracked_model import TrackedModel
 
 PAIRS_HELD_OUT, LEAST_HELD_OUT = 0.2, 4
 """Share of the pairs with depth that no registration or solve sees, and how few are too few to judge by."""

@@ -6,8 +6,8 @@ import numpy as np
 
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.refine.reprojection_cost import named
-from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.types import Bools
+from hodge_pipeline.types.tracked_model import TrackedModel
 
 LEAST_SHARED = 3
 """Points that fix a pose."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import bdtrc
 
-from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.types import Bools, Floats, Ints, ModelQuality
 from hodge_pipeline.types.text import counted
+from hodge_pipeline.types.tracked_model import TrackedModel
 
 CONTRADICTING_PX = 4.0
 """Mean error at which observations contradict each other: COLMAP filters each that is farther off."""

@@ -11,9 +11,9 @@ from hodge_pipeline.complex.chi2 import chi2_by_information
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.refine.guard import PoseChange
 from hodge_pipeline.solvers.covariance import marginal_covariances
-from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.types import Bools, Floats, Ints, Solution, ViewGraph
 from hodge_pipeline.types.arrays import evenly, rms
+from hodge_pipeline.types.tracked_model import TrackedModel
 
 MOST_SAMPLED = 60
 """Poses whose covariance is computed: enough for a root mean square."""

@@ -13,9 +13,9 @@ from hodge_pipeline.pairs.edits import FILE, write_history_file
 from hodge_pipeline.refine.reprojection_cost import SAME_COST, costs
 from hodge_pipeline.review.session import Session
 from hodge_pipeline.review.subject import SIDE_FILE, Subject
-from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.types import Floats, Trajectory, ViewGraph
 from hodge_pipeline.types.text import counted
+from hodge_pipeline.types.tracked_model import TrackedModel
 from hodge_pipeline.uses.model_folder import MODELS
 
 SAME_PX = 1e-3

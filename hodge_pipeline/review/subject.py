@@ -22,11 +22,11 @@ from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import true_poses
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.sources.inspect import guesses
-from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.store.workspace import is_run_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Solution, Source, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, REJECTED, USED
 from hodge_pipeline.types.text import UNKNOWN_UNIT
+from hodge_pipeline.types.tracked_model import TrackedModel
 
 LOG = "decisions.csv"
 """The log in a folder."""

@@ -10,10 +10,11 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.stages import ModelReader, TrackedModel
+from hodge_pipeline.stages import ModelReader
 from hodge_pipeline.testing.readers import check_view_graph
 from hodge_pipeline.testing.stage import Contract, raises
 from hodge_pipeline.types import Floats
+from hodge_pipeline.types.tracked_model import TrackedModel
 
 NEAR = 1e-6
 """What a file of 17 digits and a few products of matrices lose."""

@@ -11,10 +11,10 @@ from typing import Any
 
 from hodge_pipeline.refine.model import RefinedModel, refine_models
 from hodge_pipeline.refine.model_options import RECIPE, ModelRefinement, load_model_refinement
-from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.store.cost import Monitor
 from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.store.store import Store
+from hodge_pipeline.types.tracked_model import TrackedModel
 from hodge_pipeline.uses.model_folder import model_workspace, write_run_folder
 
 

@@ -19,11 +19,11 @@ from hodge_pipeline.refine.model import RefinedModel
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.report.refined import model_report
 from hodge_pipeline.report.write import write_report
-from hodge_pipeline.stages import TrackedModel
 from hodge_pipeline.store.cost import Cost
 from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.workspace import REFINEMENT, Workspace
 from hodge_pipeline.types import Source, Trajectory
+from hodge_pipeline.types.tracked_model import TrackedModel
 
 MODELS = "sparse"
 """The folder of the models, as COLMAP calls it."""

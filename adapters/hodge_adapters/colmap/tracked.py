@@ -35,7 +35,6 @@ from hodge_adapters.colmap.scale import seen_depths
 from hodge_adapters.colmap.ties import apart_matches, merge_matched_points
 from hodge_adapters.colmap.uncertainty import standard_errors
 from hodge_pipeline import se3
-from hodge_pipeline.stages import Adjusted
 from hodge_pipeline.types import (
     Bools,
     CloudSet,
@@ -48,6 +47,7 @@ from hodge_pipeline.types import (
     ViewGraph,
 )
 from hodge_pipeline.types.text import counted
+from hodge_pipeline.types.tracked_model import Adjusted
 
 LEAST_LEFT = 3
 """Entries of a track: two would meet in a point wherever the images are."""
@@ -87,7 +87,7 @@ class PriorOptions:
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """See `stages.TrackedModel`. The reconstruction is never changed in place."""
+    """See `types.tracked_model.TrackedModel`. The reconstruction is never changed in place."""
 
     name: str
     reconstruction: pycolmap.Reconstruction
