@@ -5,7 +5,6 @@ A g2o information matrix is over (translation, q_vec): half an angle. Ours is ov
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,28 +12,25 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass as stage
 
 from hodge_adapters.pose_graphs import g2o_priors, g2o_switches
+from hodge_adapters.pose_graphs.content import (
+    Content,
+    as_source,
+    has_information,
+    refuse_landmarks_alone,
+    skipped,
+    upper_triangle,
+)
+from hodge_adapters.pose_graphs.planar import flatten_information, flatten_poses, lift_information, lift_poses
 from hodge_adapters.pose_graphs.text import LANDMARK_TAGS, Records, count_tags, read_records, write_lines
 from hodge_adapters.posed import graph_of, length_notes, written_graph
 from hodge_adapters.text_rows import write_text_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
-from hodge_pipeline.types import Floats, Ints, Source, Trajectory, ViewGraph
-from hodge_pipeline.types.text import counted
+from hodge_pipeline.types import Floats, Source, ViewGraph
 
 HALF_ANGLE = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
 """d(q_vec, t) / d(φ, ρ) at the identity."""
-PLANAR_TWIST = np.array([3, 4, 2])
-"""Where (x, y, θ) lie in (φ, ρ)."""
-SKIPPED_TAGS_SHOWN = 5
-
-
-def upper_triangle(values: Floats, size: int) -> Floats:
-    """Symmetric matrices (N, size, size) of their upper triangles (N, size (size + 1) / 2), row by row."""
-    rows, columns = np.triu_indices(size)
-    out = np.zeros((len(values), size, size))
-    out[:, rows, columns] = out[:, columns, rows] = values
-    return out
 
 
 def information_of_file(information: Floats) -> Floats:
@@ -48,28 +44,6 @@ def information_for_file(information: Floats) -> Floats:
     return np.roll(information / np.outer(HALF_ANGLE, HALF_ANGLE), (-3, -3), axis=(-2, -1))
 
 
-def lift_poses(poses: Floats) -> Floats:
-    """Motions (N, 4, 4) about z of planar poses (N, 3) = (x, y, θ)."""
-    rotation = np.broadcast_to(np.eye(3), (len(poses), 3, 3)).copy()
-    cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    rotation[:, 0, 0] = rotation[:, 1, 1] = cosine
-    rotation[:, 1, 0], rotation[:, 0, 1] = sine, -sine
-    return se3.from_parts(rotation, np.pad(poses[:, :2], ((0, 0), (0, 1))))
-
-
-def flatten_poses(motions: Floats) -> Floats:
-    """Planar poses (N, 3) = (x, y, θ) of motions about z (N, 4, 4)."""
-    angle = np.arctan2(motions[:, 1, 0], motions[:, 0, 0])
-    return np.column_stack([motions[:, :2, 3], angle])
-
-
-def lift_information(information: Floats) -> Floats:
-    """6x6 matrices over (φ, ρ) of planar ones (E, 3, 3) over (x, y, θ), zero out of the plane."""
-    out = np.zeros((len(information), 6, 6))
-    out[:, PLANAR_TWIST[:, None], PLANAR_TWIST] = information
-    return out
-
-
 def spatial_poses(records: Records) -> Floats:
     """Motions (N, 4, 4) of x y z qx qy qz qw; a zero quaternion is refused with its line."""
     quat = records.values[:, 3:7]
@@ -77,21 +51,7 @@ def spatial_poses(records: Records) -> Floats:
     return se3.from_quat_xyzw(records.values[:, :3], quat)
 
 
-@dataclass(frozen=True)
-class Half:
-    """The vertices and edges of one dimension."""
-
-    vertex_keys: Ints
-    poses: Floats
-    edge_keys: Ints
-    motions: Floats
-    information: Floats
-    prior_keys: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    prior_poses: Floats = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    prior_information: Floats = field(default_factory=lambda: np.zeros((0, 6, 6)))
-
-
-def _spatial(records: dict[str, Records], notes: list[str]) -> Half:
+def _spatial(records: dict[str, Records], notes: list[str]) -> Content:
     vertices, edges = records["VERTEX_SE3:QUAT"], records["EDGE_SE3:QUAT"]
     vertices.refuse_repeated("vertex")
     information = np.tile(np.eye(6), (len(edges), 1, 1))
@@ -105,7 +65,7 @@ def _spatial(records: dict[str, Records], notes: list[str]) -> Half:
     moved, moved_information = g2o_priors.moved_to_body(spatial_poses(levered), known[1], offsets)
     on_position = records[g2o_priors.SPATIAL_XYZ], records[g2o_priors.SPATIAL_XY]
     places, of_places = zip(*map(_positions, on_position, (3, 2)), strict=True)
-    return Half(
+    return Content(
         vertices.keys[:, 0],
         poses,
         edges.keys,
@@ -117,14 +77,6 @@ def _spatial(records: dict[str, Records], notes: list[str]) -> Half:
     )
 
 
-def has_information(edges: Records, motion: int, notes: list[str]) -> bool:
-    """Whether numbers follow those of each edge's motion; a note says where none do. Without edges they do."""
-    stated = bool(edges.values.shape[1] > motion)
-    if not stated:
-        notes.append(f"{counted(len(edges), 'edge states|edges state')} no information: taken as unknown")
-    return stated
-
-
 def _positions(known: Records, size: int) -> tuple[Floats, Floats]:
     """Poses (P, 4, 4) at known positions of so many coordinates, and the information (P, 6, 6) on these alone."""
     beside = (0, 3 - size)
@@ -134,7 +86,7 @@ def _positions(known: Records, size: int) -> tuple[Floats, Floats]:
     return se3.from_parts(np.broadcast_to(np.eye(3), (len(at), 3, 3)), at), information
 
 
-def _planar(records: dict[str, Records], notes: list[str]) -> Half:
+def _planar(records: dict[str, Records], notes: list[str]) -> Content:
     vertices, edges = records["VERTEX_SE2"], records["EDGE_SE2"]
     vertices.refuse_repeated("vertex")
     information = np.tile(np.eye(3), (len(edges), 1, 1))
@@ -144,7 +96,7 @@ def _planar(records: dict[str, Records], notes: list[str]) -> Half:
     whole, position = records[g2o_priors.PLANAR], records[g2o_priors.PLANAR_POSITION]
     anywhere = np.pad(position.values[:, :2], ((0, 0), (0, 1)))
     on_position = np.pad(upper_triangle(position.values[:, 2:], 2), ((0, 0), (0, 1), (0, 1)))
-    return Half(
+    return Content(
         vertices.keys[:, 0],
         poses,
         edges.keys,
@@ -154,66 +106,6 @@ def _planar(records: dict[str, Records], notes: list[str]) -> Half:
         lift_poses(np.concatenate([whole.values[:, :3], anywhere])),
         lift_information(np.concatenate([upper_triangle(whole.values[:, 3:], 3), on_position])),
     )
-
-
-def rows_of_keys(vertex_keys: Ints, edge_keys: Ints) -> tuple[Ints, Ints]:
-    """The vertex ids in the file's order, then those that only edges name, and the edges as rows of them (E, 2)."""
-    every = np.concatenate([vertex_keys, edge_keys.reshape(-1)])
-    unique, first, inverse = np.unique(every, return_index=True, return_inverse=True)
-    order = np.argsort(first, kind="stable")
-    rank = np.empty(len(unique), np.int64)
-    rank[order] = np.arange(len(unique))
-    return unique[order], rank[inverse.reshape(-1)[len(vertex_keys) :]].reshape(-1, 2)
-
-
-def as_source(path: Path, half: Half, kind: str, fixed_keys: Ints, dimension: int, notes: list[str]) -> Source:
-    """What the file holds: the graph, and the vertex poses as a trajectory whose stamps are row numbers, where every
-    vertex has one; notes what was incomplete.
-    """
-    ids, edges = rows_of_keys(half.vertex_keys, half.edge_keys)
-    named = len(half.vertex_keys)
-    if 0 < named < len(ids):
-        notes.append(f"{len(ids) - named} of {len(ids)} vertices are named by edges only: no initial poses")
-    fixed = np.flatnonzero(np.isin(ids, fixed_keys)).astype(np.int64)
-    if len(fixed):
-        notes.append(f"{counted(len(fixed), 'vertex is|vertices are')} marked FIX")
-    motions, information = half.motions, half.information
-    if count := int((edges[:, 0] == edges[:, 1]).sum()):
-        notes.append(f"{counted(count, 'edge joins|edges join')} a vertex to itself: they say nothing of poses")
-    graph = ViewGraph.from_edges(ids, edges, motions, information, kind, dimension=dimension, fixed=fixed)
-    priors = g2o_priors.as_priors(half.prior_keys, half.prior_poses, half.prior_information, ids, str(path))
-    if priors is not None:
-        notes.append(
-            f"{counted(len(priors.vertices), 'prior of a single vertex is|priors of single vertices are')} read"
-        )
-        graph = replace(graph, priors=priors)
-    trajectory = Trajectory(np.arange(named, dtype=float), half.poses) if named == len(ids) else None
-    return Source(path.stem, path, trajectory=trajectory, graph=graph, notes=tuple(notes), files=(path,))
-
-
-def skipped(other: dict[str, int]) -> list[str]:
-    """A note for each kind of line that is not read, with its count."""
-    shown = sorted(other.items(), key=lambda item: -item[1])
-    notes = [
-        f"{counted(count, 'line')} of kind {tag} not read{_meaning(tag)}" for tag, count in shown[:SKIPPED_TAGS_SHOWN]
-    ]
-    if len(shown) > SKIPPED_TAGS_SHOWN:
-        rest = shown[SKIPPED_TAGS_SHOWN:]
-        notes.append(f"{sum(count for _, count in rest)} lines of {len(rest)} more kinds are not read")
-    return notes
-
-
-def _meaning(tag: str) -> str:
-    if tag in g2o_switches.SWITCH_TAGS:
-        return ": switches of loops, which are judged anew"
-    return ": landmarks, where only edges between poses are solved" if tag in LANDMARK_TAGS else ""
-
-
-def refuse_landmarks_alone(path: Path, other: dict[str, int]) -> None:
-    """Raise `SourceError` for a file without poses that has landmarks."""
-    tags = sorted(LANDMARK_TAGS & set(other))
-    if tags:
-        raise SourceError(f"{path}: holds landmarks alone ({', '.join(tags)}): edges between poses are needed")
 
 
 KEYS = {"VERTEX_SE3:QUAT": 1, "EDGE_SE3:QUAT": 2, "VERTEX_SE2": 1, "EDGE_SE2": 2, "FIX": 1}
@@ -251,20 +143,20 @@ def load_g2o(path: Path | str) -> Source:
         raise SourceError(f"{path}: no g2o vertex or edge in it: expected lines such as EDGE_SE3:QUAT or EDGE_SE2")
     more_planar = len(records["VERTEX_SE2"]) > len(records["VERTEX_SE3:QUAT"])
     dimension = 2 if planar or (not spatial and more_planar) else 3
-    half = (_planar if dimension == 2 else _spatial)(records, told)
+    content = (_planar if dimension == 2 else _spatial)(records, told)
     strange = {tag: len(records[tag]) for tag in (SPATIAL_TAGS if dimension == 2 else PLANAR_TAGS) if len(records[tag])}
     notes = skipped({**other, **strange}) + told
     for tag, what in (("VERTEX_SE3:QUAT", "vertices"), ("EDGE_SE3:QUAT", "edges")):
         notes += length_notes(records[tag].values[:, 3:7], what)
     fixed_keys = records["FIX"].keys.reshape(-1)
-    absent = np.setdiff1d(fixed_keys, np.concatenate([half.vertex_keys, half.edge_keys.reshape(-1)]))
+    absent = np.setdiff1d(fixed_keys, np.concatenate([content.vertex_keys, content.edge_keys.reshape(-1)]))
     if len(absent):
         if not any(tag.startswith("VERTEX") for tag in {**other, **strange}):
             raise SourceError(
                 f"{path}: FIX names vertex {absent[0]}, which no vertex or edge line names: mend that line"
             )
         notes.append(f"{len(absent)} FIX lines name vertices that are not read, {absent[0]} first: ignored")
-    return as_source(path, half, "g2o", fixed_keys, dimension, notes)
+    return as_source(path, content, "g2o", fixed_keys, dimension, notes)
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))
@@ -330,9 +222,6 @@ def _pose_columns(motions: Floats, dimension: int) -> Floats:
 
 
 def _information_columns(information: Floats, dimension: int) -> Floats:
-    if dimension == 2:
-        planar = information[:, PLANAR_TWIST[:, None], PLANAR_TWIST]
-        rows, columns = np.triu_indices(3)
-        return np.asarray(planar[:, rows, columns])
-    rows, columns = np.triu_indices(6)
-    return np.asarray(information_for_file(information)[:, rows, columns])
+    matrices = flatten_information(information) if dimension == 2 else information_for_file(information)
+    rows, columns = np.triu_indices(matrices.shape[-1])
+    return np.asarray(matrices[:, rows, columns])

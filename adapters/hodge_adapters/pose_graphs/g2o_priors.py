@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from hodge_adapters.pose_graphs.text import Records, write_lines
 from hodge_pipeline import se3
-from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Floats, Ints, Priors
+from hodge_pipeline.types import Floats, Ints
 
 SPATIAL, SPATIAL_OFFSET, OFFSET = "EDGE_PRIOR_SE3", "EDGE_SE3_PRIOR", "PARAMS_SE3OFFSET"
 SPATIAL_XYZ, SPATIAL_XY = "EDGE_SE3_PRIORXYZ", "EDGE_SE3_PRIORXY"
@@ -42,17 +39,6 @@ def moved_to_body(world_from_sensor: Floats, information: Floats, body_from_sens
     """Poses (P, 4, 4) of the body, and the information (P, 6, 6) on them, of what is known of its sensor."""
     sensor_from_body = se3.inverse(body_from_sensor)
     return world_from_sensor @ sensor_from_body, se3.pull_back(sensor_from_body, information)
-
-
-def as_priors(keys: Ints, poses: Floats, information: Floats, ids: Ints, where: str) -> Priors | None:
-    """The priors of these vertex ids; None where there are none."""
-    if not len(keys):
-        return None
-    rows: Mapping[int, int] = {int(name): row for row, name in enumerate(ids)}
-    unknown = [int(key) for key in keys if int(key) not in rows]
-    if unknown:
-        raise SourceError(f"{where}: a prior names vertex {unknown[0]}, which no vertex or edge line names")
-    return Priors(np.array([rows[int(key)] for key in keys], np.int64), poses, information)
 
 
 def write_priors(lines: list[str], dimension: int, names: Ints, poses: Floats, information: Floats) -> None:

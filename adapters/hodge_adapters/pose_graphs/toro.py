@@ -13,16 +13,15 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass as stage
 from scipy.spatial.transform import Rotation
 
-from hodge_adapters.pose_graphs.g2o import (
-    Half,
+from hodge_adapters.pose_graphs.content import (
+    Content,
     as_source,
     has_information,
-    lift_information,
-    lift_poses,
     refuse_landmarks_alone,
     skipped,
     upper_triangle,
 )
+from hodge_adapters.pose_graphs.planar import lift_information, lift_poses
 from hodge_adapters.pose_graphs.text import Records, count_tags, read_records
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -45,17 +44,17 @@ def euler_motions(values: Floats) -> Floats:
     return se3.from_parts(rotation, values[:, :3])
 
 
-def _spatial(records: dict[str, Records], notes: list[str]) -> Half:
+def _spatial(records: dict[str, Records], notes: list[str]) -> Content:
     vertices, edges = records["VERTEX3"], records["EDGE3"]
     vertices.refuse_repeated("vertex")
     information = np.broadcast_to(np.eye(6), (len(edges), 6, 6))
     if has_information(edges, 6, notes):
         information = np.roll(upper_triangle(edges.values[:, 6:], 6), (3, 3), axis=(1, 2))
     poses, motions = euler_motions(vertices.values), euler_motions(edges.values)
-    return Half(vertices.keys[:, 0], poses, edges.keys, motions, np.array(information))
+    return Content(vertices.keys[:, 0], poses, edges.keys, motions, np.array(information))
 
 
-def _planar(records: dict[str, Records], notes: list[str]) -> Half:
+def _planar(records: dict[str, Records], notes: list[str]) -> Content:
     vertices, edges = records["VERTEX2"], records["EDGE2"]
     vertices.refuse_repeated("vertex")
     information = np.broadcast_to(np.eye(3), (len(edges), 3, 3))
@@ -66,10 +65,10 @@ def _planar(records: dict[str, Records], notes: list[str]) -> Half:
             notes.append("information read row by row (iSAM's order): the file has no vertices")
         information = upper_triangle(raw if by_rows else raw[:, TORO_ORDER], 3)
     poses, motions = lift_poses(vertices.values), lift_poses(edges.values[:, :3])
-    return Half(vertices.keys[:, 0], poses, edges.keys, motions, lift_information(np.array(information)))
+    return Content(vertices.keys[:, 0], poses, edges.keys, motions, lift_information(np.array(information)))
 
 
-def _merge(half: Half, pairs: Ints) -> Half:
+def _merge(content: Content, pairs: Ints) -> Content:
     """The same with vertices that EQUIV pairs join, directly or by others, one vertex: one that is named second."""
     keep_of: dict[int, int] = {}
 
@@ -82,9 +81,9 @@ def _merge(half: Half, pairs: Ints) -> Half:
     for a, b in pairs.tolist():
         if (joined := root(a)) != root(b):
             keep_of[joined] = root(b)
-    merged = np.array([root(int(key)) for key in half.edge_keys.reshape(-1)], np.int64).reshape(-1, 2)
-    kept = np.array([root(int(key)) == key for key in half.vertex_keys], bool)
-    return Half(half.vertex_keys[kept], half.poses[kept], merged, half.motions, half.information)
+    merged = np.array([root(int(key)) for key in content.edge_keys.reshape(-1)], np.int64).reshape(-1, 2)
+    kept = np.array([root(int(key)) == key for key in content.vertex_keys], bool)
+    return Content(content.vertex_keys[kept], content.poses[kept], merged, content.motions, content.information)
 
 
 def load_toro(path: Path | str) -> Source:
@@ -101,11 +100,11 @@ def load_toro(path: Path | str) -> Source:
         refuse_landmarks_alone(path, other)
         raise SourceError(f"{path}: no TORO edge in it: expected lines such as EDGE3 or EDGE2")
     notes = skipped(other)
-    half = (_planar if planar else _spatial)(records, notes)
+    content = (_planar if planar else _spatial)(records, notes)
     if len(equal := records["EQUIV"].keys):
-        half = _merge(half, equal)
+        content = _merge(content, equal)
         notes.append(f"{len(equal)} EQUIV lines: those vertices are merged")
-    return as_source(path, half, "toro", np.zeros(0, np.int64), 2 if planar else 3, notes)
+    return as_source(path, content, "toro", np.zeros(0, np.int64), 2 if planar else 3, notes)
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))
