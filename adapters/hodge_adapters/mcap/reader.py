@@ -6,11 +6,10 @@ A recording is gone through once when opened, without decoding an image; frames 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -18,29 +17,22 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters.association import nearest_in_runs, unpaired_doubts
 from hodge_adapters.images.camera_files import Intrinsics, checked
-from hodge_adapters.images.frames import Lens, undistorted
-from hodge_adapters.images.second_camera import SecondCamera, encoded_on_depth_pixels, read_on_depth_pixels
-from hodge_adapters.mcap.clouds import lies_far, read_points
+from hodge_adapters.images.frames import Lens
+from hodge_adapters.images.second_camera import SecondCamera
+from hodge_adapters.mcap.cameras import find_camera, second_cameras
+from hodge_adapters.mcap.clouds import lies_far
 from hodge_adapters.mcap.files import find_files, sniff_recording
 from hodge_adapters.mcap.fixes import positions_of
-from hodge_adapters.mcap.images import UNITS_PER_METRE, ImageLayout, encoded_image, read_colour, read_depth
+from hodge_adapters.mcap.frames import cloud_frames, colour_frames, depth_frames
+from hodge_adapters.mcap.images import ImageLayout
 from hodge_adapters.mcap.poses import PoseOptions, find_poses
 from hodge_adapters.mcap.recording import A_MESSAGE_WITH, NO_PINHOLE, Recording, Seen
 from hodge_adapters.mcap.ros_tf import TransformTree
-from hodge_adapters.mcap.topics import (
-    ImageTopics,
-    best_colour,
-    best_depth,
-    find_camera,
-    named_topic,
-    one_per_stamp,
-    second_cameras,
-    split_depth,
-)
+from hodge_adapters.mcap.topics import ImageTopics, best_colour, best_depth, named_topic, one_per_stamp, split_depth
 from hodge_adapters.text_rows import listed
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
-from hodge_pipeline.types import Camera, EncodedImage, Floats, Frame, Source
+from hodge_pipeline.types import Camera, Floats, Frame, Source
 from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.text import counted
 
@@ -177,24 +169,8 @@ class McapReader:
         coloured = self._associated(topic, images, colour_topic, colour, second, notes)
         if colour_topic:
             doubts += unpaired_doubts([image is not None for image in coloured])
-        units, frames = self.depth_scale or UNITS_PER_METRE, []
-        given: dict[str, Any] = {"units_per_metre": self.depth_scale, "no_depth": self.no_depth}
-        for row, (image, other) in enumerate(zip(images, coloured, strict=True)):
-            is_plain_png = image.layout.coding == "png" and image.layout.quantisation is None
-            frame = Frame(
-                frame_id=row,
-                stamp_s=image.stamp_s,
-                camera=camera,
-                read_depth=partial(read_depth, image.payload, image.layout, **given),
-                encoded_depth=partial(encoded_image, image.payload, image.layout, units) if is_plain_png else None,
-                read_colour=partial(read_colour, other.payload, other.layout) if other else None,
-                encoded_colour=_encoded_colour(other),
-                colour_delay_s=other.stamp_s - image.stamp_s if other else 0.0,
-            )
-            if second:
-                frame = replace(frame, read_colour=None)
-            frame = undistorted(frame, lens, units) if lens else frame
-            frames.append(_beside(frame, other, second) if second and other else frame)
+        scale = self.depth_scale
+        frames = depth_frames(images, coloured, camera, lens, second, depth_scale=scale, no_depth=self.no_depth)
         return frames, _coordinate_frame(topic, images, notes)
 
     def _second_cameras(
@@ -243,30 +219,14 @@ class McapReader:
             notes.append(
                 f"{topic}: its points lie far from zero and are rounded, since 32-bit numbers lose digits there"
             )
-        frames = [
-            Frame(row, cloud.stamp_s, read_points=partial(read_points, cloud.payload, cloud.layout))
-            for row, cloud in enumerate(clouds)
-        ]
-        return frames, _coordinate_frame(topic, clouds, notes)
+        return cloud_frames(clouds), _coordinate_frame(topic, clouds, notes)
 
     def _colour_frames(self, recording: Recording, colour: ImageTopics, notes: list[str]) -> tuple[list[Frame], str]:
         topic = self._pick(colour, self.colour_topic, "colour_topic", notes)
         images = one_per_stamp(topic, colour[topic], notes)
         camera, lens = self._camera(recording, topic, images[0], notes) or (None, None)
         notes.append(f"frames are the images of {topic} alone: there is neither depth nor a point cloud")
-        frames = [
-            Frame(
-                row,
-                image.stamp_s,
-                camera,
-                read_colour=partial(read_colour, image.payload, image.layout),
-                encoded_colour=_encoded_colour(image),
-            )
-            for row, image in enumerate(images)
-        ]
-        if lens:
-            frames = [undistorted(frame, lens, UNITS_PER_METRE) for frame in frames]
-        return frames, _coordinate_frame(topic, images, notes)
+        return colour_frames(images, camera, lens), _coordinate_frame(topic, images, notes)
 
     def _camera(
         self, recording: Recording, topic: str, image: Seen[ImageLayout], notes: list[str]
@@ -288,23 +248,6 @@ class McapReader:
 
 def _stamps(seen: Sequence[Seen[Layout]]) -> Floats:
     return np.array([item.stamp_s for item in seen], float)
-
-
-def _beside(frame: Frame, image: Seen[ImageLayout], second: SecondCamera) -> Frame:
-    """The frame with colour of a camera beside that of its depth, on the pixels of depth."""
-    assert frame.read_depth is not None and frame.camera is not None
-    given = partial(read_colour, image.payload, image.layout), frame.read_depth, frame.camera, second
-    return replace(
-        frame,
-        read_colour=partial(read_on_depth_pixels, *given),
-        encoded_colour=partial(encoded_on_depth_pixels, *given),
-    )
-
-
-def _encoded_colour(image: Seen[ImageLayout] | None) -> Callable[[], EncodedImage] | None:
-    if image is None or image.layout.coding == "raw":
-        return None
-    return partial(encoded_image, image.payload, image.layout)
 
 
 def _coordinate_frame(topic: str, seen: Sequence[Seen[Layout]], notes: list[str]) -> str:
