@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from hodge_pipeline.cli import refine as refining
-from hodge_pipeline.cli.guard import guard_streams, shown_error
+from hodge_pipeline.cli.error_lines import one_line_errors
+from hodge_pipeline.cli.guard import guard_streams
 from hodge_pipeline.cli.options import (
     Dask,
     Json,
@@ -352,34 +352,10 @@ def compare(
 
 
 def main() -> None:
-    """Run the command; what a user can mend is one line and exit code 1 (3: a result that failed its checks)."""
+    """Run the command; see `one_line_errors`."""
     guard_streams()
-    try:
+    with one_line_errors():
         app(standalone_mode=True)  # which ends with 130 on Ctrl-C
-    except OSError as error:
-        if error.filename is None and error.errno is None:
-            raise
-        print(f"error: {shown_error(error.filename or 'a file')}: {error.strerror}", file=sys.stderr)
-        sys.exit(1)
-    except MemoryError:
-        print("error: this needs more memory than there is: give less data, or free some", file=sys.stderr)
-        sys.exit(1)
-    except ImportError as error:
-        if (error.name or "").startswith("hodge"):
-            raise
-        from hodge_pipeline.registry import LIBRARIES
-
-        print(f"error: a library does not load ({shown_error(error)}): {LIBRARIES}", file=sys.stderr)
-        sys.exit(1)
-    except Exception as error:
-        from hodge_pipeline.errors import HodgeError
-        from hodge_pipeline.registry import plugin_error
-
-        known = plugin_error(error) or error
-        if not isinstance(known, HodgeError):
-            raise
-        print(f"error: {shown_error(known)}", file=sys.stderr)
-        sys.exit(known.exit_code)
 
 
 if __name__ == "__main__":
