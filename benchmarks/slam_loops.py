@@ -30,7 +30,8 @@ from edges_peers import consecutive, gtsam_gnc, installed_peers, open3d_line_pro
 
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.refine.pose_graph import read_graph
-from hodge_pipeline.solvers.backbone.chain import linear_forest, make_chain, sequential_edges
+from hodge_pipeline.solvers.backbone.chain import make_chain
+from hodge_pipeline.solvers.backbone.sequence import linear_forest, sequential_edges
 from hodge_pipeline.types import Floats, ViewGraph
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "pose_graphs" / "slam_loops"

@@ -13,10 +13,11 @@ from hodge_pipeline.diagnosis.options import WRONG_BELOW, DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
 from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.solvers.backbone import fit
-from hodge_pipeline.solvers.backbone.chain import linear_forest, make_chain, sequential_edges
+from hodge_pipeline.solvers.backbone.chain import make_chain
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, optimised
 from hodge_pipeline.solvers.backbone.lattice import lattice_backbone
 from hodge_pipeline.solvers.backbone.linear import cholesky, linearise
+from hodge_pipeline.solvers.backbone.sequence import linear_forest, sequential_edges
 from hodge_pipeline.solvers.backbone.sparse import NormalEquations
 from hodge_pipeline.solvers.backbone.trust import find_backbone, of_every_loop
 from hodge_pipeline.solvers.maximum_likelihood import solve

@@ -10,9 +10,9 @@ from benchmarks.wrong_loops import simulated_cases
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.solvers.backbone.breaks import StepModel
 from hodge_pipeline.solvers.backbone.chain import make_chain
 from hodge_pipeline.solvers.backbone.inference import BY_CHANCE
+from hodge_pipeline.solvers.backbone.step_model import StepModel
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.types import ViewGraph
 from tests.backbone_graphs import WORLDS, Drive, broken, drive, spanned

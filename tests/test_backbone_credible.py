@@ -12,7 +12,8 @@ from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.refine.pose_graph import read_graph
-from hodge_pipeline.solvers.backbone.chain import credible_steps, sequential_edges
+from hodge_pipeline.solvers.backbone.credible import credible_steps
+from hodge_pipeline.solvers.backbone.sequence import sequential_edges
 from hodge_pipeline.types import Floats, ViewGraph
 from tests.backbone_graphs import drive
 from tests.test_backbone import NEVER_WORSE

@@ -10,8 +10,8 @@ import pytest
 from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import has_unit_information, in_vertex_order
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.solvers.backbone.chain import consecutive_edges
 from hodge_pipeline.solvers.backbone.parallel import FEWEST, fused, loops_once
+from hodge_pipeline.solvers.backbone.sequence import consecutive_edges
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.types import Ints, ViewGraph
 from tests.backbone_graphs import STEP, drive

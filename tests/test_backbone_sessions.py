@@ -8,7 +8,7 @@ import pytest
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.result import UNTESTABLE
-from hodge_pipeline.solvers.backbone.chain import consecutive_edges
+from hodge_pipeline.solvers.backbone.sequence import consecutive_edges
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Bools, ViewGraph
 from tests.backbone_graphs import Drive, drive

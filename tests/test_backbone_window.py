@@ -12,8 +12,8 @@ from hodge_pipeline.complex.chi2 import has_unit_information
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import solve_robust
-from hodge_pipeline.solvers.backbone.chain import consecutive_edges
 from hodge_pipeline.solvers.backbone.parallel import Fused
+from hodge_pipeline.solvers.backbone.sequence import consecutive_edges
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.solvers.backbone.window import windowed
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph

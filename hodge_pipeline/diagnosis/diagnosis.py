@@ -30,8 +30,8 @@ from hodge_pipeline.diagnosis.robust_poses import Solved
 from hodge_pipeline.diagnosis.shared_blame import share_blame
 from hodge_pipeline.diagnosis.wording import reasons
 from hodge_pipeline.one_blas_thread import one_blas_thread
-from hodge_pipeline.solvers.backbone.chain import vertex_ranks
 from hodge_pipeline.solvers.backbone.lattice import lattice_backbone, steps_are_wrong
+from hodge_pipeline.solvers.backbone.sequence import vertex_ranks
 from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
 from hodge_pipeline.solvers.resistance import Network
 from hodge_pipeline.solvers.weights import OUT_OF_PLANE, dimension_of

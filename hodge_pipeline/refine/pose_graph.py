@@ -18,7 +18,8 @@ from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.errors import GraphError, SourceError
 from hodge_pipeline.pairs.edits import joining
 from hodge_pipeline.recipe.recipe_file import recipe_names
-from hodge_pipeline.solvers.backbone.chain import credible_steps, sequential_edges
+from hodge_pipeline.solvers.backbone.credible import credible_steps
+from hodge_pipeline.solvers.backbone.sequence import sequential_edges
 from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.setup import InitialName

@@ -9,16 +9,8 @@ from functools import partial
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.solvers.backbone.breaks import (
-    LOOSE,
-    Break,
-    PairwiseConsistency,
-    Runs,
-    StepModel,
-    agreed_breaks,
-    unusual_breaks,
-)
-from hodge_pipeline.solvers.backbone.chain import Chain, linked, loops_at_place
+from hodge_pipeline.solvers.backbone.breaks import LOOSE, Break, Runs, agreed_breaks, unusual_breaks
+from hodge_pipeline.solvers.backbone.chain import Chain, linked
 from hodge_pipeline.solvers.backbone.evidence import OutlierModel, mixture, student_log_density
 from hodge_pipeline.solvers.backbone.fit import Fit, optimised
 from hodge_pipeline.solvers.backbone.inference import (
@@ -31,8 +23,11 @@ from hodge_pipeline.solvers.backbone.inference import (
 )
 from hodge_pipeline.solvers.backbone.judge import by_path
 from hodge_pipeline.solvers.backbone.linear import linearise
+from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
+from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.places import MISTAKEN_PLACES, MOST_STEPS, agreeing_groups
 from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales
+from hodge_pipeline.solvers.backbone.step_model import StepModel
 from hodge_pipeline.types import Bools, Ints
 
 MOST_BREAKS, TRIED_AT_ONCE = 10, 2

@@ -6,20 +6,24 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import has_unit_information
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.cycles import spanning_forest
 from hodge_pipeline.solvers.backbone import plane
-from hodge_pipeline.solvers.weights import PLANAR_AXES
+from hodge_pipeline.solvers.backbone.credible import credible_steps, free_axes
+from hodge_pipeline.solvers.backbone.loop_places import corridors, one_of_each_place
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 PLACE = 4.0
 """Length of a place: steps whose variances add up to those of this many loops."""
 STEPS_OF_PLACE, FEWEST_PLACES = 20, 50
 """Fewest steps of a place, however large their errors; fewest places of a chain, however small these are."""
+SMALLEST_SIGMA = 0.03
+"""Share of the median standard deviation that is added to each, in squares. Beside one of a thousandth the normal
+equations lose the other edges to rounding; from .01 to .1 the manhattan graph is judged alike.
+"""
 
 
 @dataclass(frozen=True)
@@ -163,50 +167,6 @@ class Chain:
         return se3.exp(twists) if self.is_spatial else plane.exp(twists)
 
 
-def consecutive_edges(graph: ViewGraph) -> Bools:
-    """Which edges (E,) join vertices that follow each other in the order of their ids."""
-    return np.asarray(steps_apart(graph) == 1)
-
-
-def steps_apart(graph: ViewGraph) -> Ints:
-    """The distance (E,) of the vertices of each edge in the order of their ids."""
-    return np.asarray(np.abs(np.diff(vertex_ranks(graph)[graph.edges], axis=1)[:, 0]))
-
-
-def vertex_ranks(graph: ViewGraph) -> Ints:
-    """The rank (V,) of each vertex by its id where ids are numbers, else its row."""
-    if graph.vertex_ids.dtype.kind in "iu":
-        return np.argsort(np.argsort(graph.vertex_ids, kind="stable"), kind="stable")
-    return np.arange(graph.vertex_count)
-
-
-def sequential_edges(graph: ViewGraph) -> Bools:
-    """Which edges (E,) are consecutive, only the first of parallel ones."""
-    out, rows = np.zeros(graph.edge_count, bool), np.flatnonzero(consecutive_edges(graph))
-    out[rows[np.unique(np.sort(graph.edges[rows], axis=1), axis=0, return_index=True)[1]]] = True
-    return out
-
-
-def linear_forest(edges: Ints, count: int, trusted: Bools) -> Bools:
-    """Trusted edges (E,) that form paths: a linear forest, chosen greedily, edges between near vertex rows first."""
-    rows = np.flatnonzero(trusted & (edges[:, 0] != edges[:, 1]))
-    rows = rows[np.argsort(np.abs(edges[rows, 0] - edges[rows, 1]), kind="stable")]
-    degree, root = [0] * count, list(range(count))
-
-    def find(vertex: int) -> int:
-        while root[vertex] != vertex:
-            root[vertex] = root[root[vertex]]
-            vertex = root[vertex]
-        return vertex
-
-    out = np.zeros(len(edges), bool)
-    for row, (i, j) in zip(rows.tolist(), edges[rows].tolist(), strict=True):
-        if degree[i] < 2 and degree[j] < 2 and (a := find(i)) != (b := find(j)):
-            degree[i], degree[j], root[a] = degree[i] + 1, degree[j] + 1, b
-            out[row] = True
-    return out
-
-
 def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
     """The chain of the backbone's edges (E,), a linear forest; the other edges are its loops, without self-loops."""
     graph, as_stated = credible_steps(graph, backbone)
@@ -242,53 +202,6 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
         axes,
         as_stated and not has_unit_information(graph),
     )
-
-
-SMALLEST_SIGMA = 0.03
-"""Share of the median standard deviation that is added to each, in squares. Beside one of a thousandth the normal
-equations lose the other edges to rounding; from .01 to .1 the manhattan graph is judged alike.
-"""
-
-
-MOST_OF_A_STEP = 0.2
-"""Bound on the error of odometry as a share of its motion (root mean squares), unless it states more. On 71 simulated
-graphs without information 75 wrong loops were kept without it and 19 with it, 13 and 12 right ones lost.
-"""
-NOTHING_RAD, NOTHING_TIMES = np.pi, 100.0
-"""Standard deviations beyond which an axis is unconstrained: radians, and multiples of that of the median axis of the
-translation. Robots on a floor have 1e6 in their odometry's covariance for what they assume, 1e3 for the unknown.
-"""
-
-
-def credible_steps(graph: ViewGraph, steps: Bools) -> tuple[ViewGraph, bool]:
-    """The graph with credible information on its steps (E,), and whether that is what they state.
-
-    Along an axis that most steps leave unconstrained, errors are set to those of the other axes of rotation or
-    translation, or to `MOST_OF_A_STEP` of the motion where that is more. The identity, for unknown information, stays.
-    """
-    rows, axes = np.flatnonzero(steps), free_axes(graph)
-    if has_unit_information(graph) or not len(rows):
-        return graph, True
-    covariance = se3.covariances(graph.information[rows[:, None, None], axes[:, None], axes])
-    moved, spread = se3.log(graph.i_from_j[rows])[:, axes], np.sqrt(np.einsum("sii->si", covariance))
-    usual, factor = np.median(spread, axis=0), np.ones_like(spread)
-    for part, least in ((np.flatnonzero(axes < 3), NOTHING_RAD), (np.flatnonzero(axes >= 3), 0.0)):
-        step = float(np.sqrt(np.mean(moved[:, part] ** 2)))
-        as_stated = usual[part] <= (least or max(step, NOTHING_TIMES * float(np.median(usual[part]))))
-        if not as_stated.all() and step > 0:
-            others = np.sqrt(np.mean(spread[:, part[as_stated]] ** 2, axis=1)) if as_stated.any() else 0.0
-            factor[:, part[~as_stated]] = (np.maximum(others, MOST_OF_A_STEP * step) / spread[:, part[~as_stated]].T).T
-    if (factor == 1).all():
-        return graph, True
-    information = graph.information.copy()
-    inverse = np.linalg.inv(factor[:, :, None] * covariance * factor[:, None, :])
-    information[rows[:, None, None], axes[:, None], axes] = inverse
-    return replace(graph, information=information), False
-
-
-def free_axes(graph: ViewGraph) -> Ints:
-    """The axes (p,) of a twist in which the graph's frames move."""
-    return PLANAR_AXES if graph.dimension == 2 else np.arange(6)
 
 
 def linked(chain: Chain, low: int, high: int, motion: Floats, covariance: Floats) -> Chain:
@@ -334,41 +247,3 @@ def _walk(edges: Ints, count: int, rows: Ints) -> tuple[Ints, Ints, Ints]:
     path = np.argsort(np.argsort(begins))[component]
     order = np.lexsort((forest.depth, path))
     return order, np.append(rows, -1)[forest.parent_edge[order]], path[order]
-
-
-def loops_at_place(ends: Floats) -> Floats:
-    """How many loops (M,), itself included, are of the same place as each; `ends (M, 2)` as in `Chain.places`."""
-    near = cKDTree(ends).query_ball_point(ends, 1.0, p=np.inf, return_length=True) if len(ends) else []
-    return np.asarray(near, float)
-
-
-def one_of_each_place(ends: Floats) -> Ints:
-    """Rows of one loop of each place, ascending, those with most loops near first; `ends (M, 2)` in places."""
-    tree, free, out = cKDTree(ends), np.ones(len(ends), bool), []
-    for row in np.argsort(-loops_at_place(ends), kind="stable").tolist():
-        if free[row]:
-            out.append(row)
-            free[tree.query_ball_point(ends[row], 1.0, p=np.inf)] = False
-    return np.sort(np.array(out, np.int64))
-
-
-def corridors(ends: Floats) -> Ints:
-    """The corridor (K,) of each loop: a run of adjacent places, cut to `LONGEST_CORRIDOR`; `ends (K, 2)` in places."""
-    if not len(ends):
-        return np.zeros(0, np.int64)
-    run = connected_components(cKDTree(ends).query_pairs(ADJACENT, p=np.inf, output_type="ndarray"), len(ends))
-    order = np.argsort(run, kind="stable")
-    first = np.unique(run[order], return_index=True)[1]
-    low, high = (reduce.reduceat(ends[order], first) for reduce in (np.minimum, np.maximum))
-    axis = (high - low).argmax(axis=1)[run]
-    along = ends[np.arange(len(ends)), axis] - low[run, axis]
-    parts = np.stack([run, (along / LONGEST_CORRIDOR).astype(np.int64)], axis=1)
-    return np.unique(parts, axis=0, return_inverse=True)[1].reshape(-1)
-
-
-ADJACENT = 2.0
-"""Distance in places up to which places are adjacent: a corridor that is mistaken for another counts once."""
-LONGEST_CORRIDOR = 5.0
-"""Most places of a mistaken corridor, of 20 steps or more each: a longer run is cut. Without a limit none of 52 loops
-of a second lap counted, each of which says nothing alone beside 160 m of drift.
-"""

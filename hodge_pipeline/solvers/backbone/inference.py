@@ -10,11 +10,12 @@ from scipy.spatial import cKDTree
 from scipy.special import expit
 
 from hodge_pipeline.complex.series import series_classes
-from hodge_pipeline.solvers.backbone.chain import Chain, loops_at_place, one_of_each_place
+from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, from_rotations, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, judge
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
+from hodge_pipeline.solvers.backbone.loop_places import loops_at_place, one_of_each_place
 from hodge_pipeline.solvers.backbone.places import MOST_STEPS, MOST_TRIED, Places
 from hodge_pipeline.solvers.backbone.polish import polished
 from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales

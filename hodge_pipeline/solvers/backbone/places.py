@@ -13,12 +13,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import gammaln, pdtrc
 
-from hodge_pipeline.solvers.backbone.breaks import PairwiseConsistency
-from hodge_pipeline.solvers.backbone.chain import corridors, loops_at_place, one_of_each_place
 from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel, log_student, student_log_density
 from hodge_pipeline.solvers.backbone.fit import Fit, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, by_path, judge
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
+from hodge_pipeline.solvers.backbone.loop_places import corridors, loops_at_place, one_of_each_place
+from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.scales import decoys
 from hodge_pipeline.types import Bools, Floats, Ints
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from hodge_pipeline.complex.chi2 import tail_weight
-from hodge_pipeline.solvers.backbone.chain import loops_at_place
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, optimised
 from hodge_pipeline.solvers.backbone.linear import Linear
+from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
 from hodge_pipeline.types import Floats
 
 LOCAL = 0.5

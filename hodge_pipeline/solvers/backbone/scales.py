@@ -8,10 +8,11 @@ from dataclasses import astuple, dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from hodge_pipeline.solvers.backbone.breaks import PairwiseConsistency
-from hodge_pipeline.solvers.backbone.chain import MOST_OF_A_STEP, Chain
+from hodge_pipeline.solvers.backbone.chain import Chain
+from hodge_pipeline.solvers.backbone.credible import MOST_OF_A_STEP
 from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel, OutlierResiduals, mixture, student_log_density
 from hodge_pipeline.solvers.backbone.linear import linearise
+from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.types import Floats, Ints
 
 FOLD = np.log(4.0)

@@ -8,8 +8,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
-from hodge_pipeline.solvers.backbone.chain import Chain, make_chain, sequential_edges
+from hodge_pipeline.solvers.backbone.chain import Chain, make_chain
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis
+from hodge_pipeline.solvers.backbone.sequence import sequential_edges
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 LOOPS_AT_A_STEP = 0.5

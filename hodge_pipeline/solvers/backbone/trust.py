@@ -11,20 +11,14 @@ from scipy.special import expit
 from hodge_pipeline.complex.chi2 import chi2_by_information, has_unit_information, tail_gate, tail_weight
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone.bridged import MOST_BREAKS, infer_bridged
-from hodge_pipeline.solvers.backbone.chain import (
-    Chain,
-    consecutive_edges,
-    credible_steps,
-    linear_forest,
-    make_chain,
-    one_of_each_place,
-    sequential_edges,
-    vertex_ranks,
-)
+from hodge_pipeline.solvers.backbone.chain import Chain, make_chain
+from hodge_pipeline.solvers.backbone.credible import credible_steps
 from hodge_pipeline.solvers.backbone.inference import Inferred
 from hodge_pipeline.solvers.backbone.linear import Linear
+from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.parallel import Fused, fused, loops_once
 from hodge_pipeline.solvers.backbone.polish import LOCAL
+from hodge_pipeline.solvers.backbone.sequence import consecutive_edges, linear_forest, sequential_edges, vertex_ranks
 from hodge_pipeline.solvers.backbone.step_tests import LOOPS_AT_A_STEP, agreeing_loops, is_tested
 from hodge_pipeline.solvers.backbone.window import windowed
 from hodge_pipeline.solvers.maximum_likelihood import solve

@@ -15,17 +15,12 @@ from hodge_pipeline.complex.chi2 import (
     has_unit_information,
     tail_weight,
 )
-from hodge_pipeline.solvers.backbone.chain import (
-    STEPS_OF_PLACE,
-    Chain,
-    make_chain,
-    sequential_edges,
-    steps_apart,
-)
+from hodge_pipeline.solvers.backbone.chain import STEPS_OF_PLACE, Chain, make_chain
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis
 from hodge_pipeline.solvers.backbone.judge import by_path
 from hodge_pipeline.solvers.backbone.linear import inverse, linearise
 from hodge_pipeline.solvers.backbone.parallel import Fused
+from hodge_pipeline.solvers.backbone.sequence import sequential_edges, steps_apart
 from hodge_pipeline.solvers.backbone.step_tests import AS_STATED, LONGEST_CYCLE, LOOPS_AT_A_STEP, TESTED, closes, gate
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.reweighted import SETTLED
