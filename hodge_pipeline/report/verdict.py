@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M
+from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M, REACH_M
 from hodge_pipeline.evaluation.difference import MEASURABLE, Change, floor_of, length
 from hodge_pipeline.report import known_positions
 from hodge_pipeline.report.contents import GraphSummary, Report, TrajectoryRow
@@ -17,9 +17,10 @@ from hodge_pipeline.types.notes import Note
 
 Outcome: TypeAlias = Literal["improved", "unchanged", "worse", "mixed", "not measured"]
 
-LARGE_RESIDUAL_M = 0.1
 LARGE_RESIDUAL_DEG = 5.0
+"""Turns a point a little more than a metre away out of `REACH_M`, the residual of a position that is large."""
 UNMATCHED_SHARE = 0.01
+"""Of pairs, each of which counts as `NO_NEIGHBOUR_M`: at this share they add a millimetre to the mean distance."""
 OTHER_SCALE, EXPLAINED = 1.1, 0.25
 """The factor between the true path and the result from which one is not in metres, if scaling by it leaves less than a
 quarter of the error: focal lengths are known to a few per cent, and units differ by 5 or 1000.
@@ -311,7 +312,7 @@ def _edge_suspicions(report: Report) -> Iterator[Note]:
 
 
 def _large_m(report: Report) -> float:
-    return LARGE_RESIDUAL_M * report.scale if report.has_metres else float("inf")
+    return REACH_M * report.scale if report.has_metres else float("inf")
 
 
 def _unmatched(report: Report) -> Iterator[Note]:
