@@ -18,8 +18,16 @@ from hodge_pipeline.types.notes import Note
 PAIRS, SPAN_S, HOPS = 24, 0.35, 3
 """Pairs of frames, evenly over the sequence; seconds between their two frames; hops of optical flow between them."""
 CORNERS, CORNER_QUALITY, CORNERS_APART_PX, BACKWARD_PX = 400, 0.005, 8.0, 0.7
+"""Corners of a frame, at most; the weakest as a share of the strongest; pixels between two; and how near to its
+beginning a corner that is followed back must end. Half or twice each, the same cameras surely fit fr1/xyz better; twice
+the corners take half as much time again.
+"""
 FEWEST_CORNERS, FEWEST_PAIRS = 60, 6
+"""Ten to each unknown of a motion; with six pairs `SURE` is passed by chance in 3.6 % of cases (Student's t)."""
 RANGE_M, EDGE_STEP = (0.3, 5.0), 0.03
+"""Where a Kinect measures; and the share of its depth by which the 3x3 pixels of a corner differ at most: others lie on
+an edge.
+"""
 LARGEST_PX = 3.0
 """Cap on a reprojection error, and the gate of inliers."""
 SURE = 2.5
