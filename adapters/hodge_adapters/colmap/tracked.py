@@ -16,6 +16,7 @@ import numpy as np
 
 from hodge_adapters.colmap.bodies import Bodies, bodies_of, body_graph
 from hodge_adapters.colmap.bundle import Refine, adjust
+from hodge_adapters.colmap.calibration_changes import calibration_changes
 from hodge_adapters.colmap.content import content_of, read_reconstruction, refreshed
 from hodge_adapters.colmap.database import database_pairs
 from hodge_adapters.colmap.edges import covisible_pairs, measured_graph
@@ -367,44 +368,8 @@ class ColmapModel:
         back = read_reconstruction(folder)
         # merging alone changes tracks, and leaves fewer points
         tracks = self.records if back.num_points3D() == self.reconstruction.num_points3D() else None
-        notes = *notes, *self._refined_cameras(back)
+        notes = *notes, *calibration_changes(self.reconstruction, back, self.refine)
         return replace(self, reconstruction=back, files=(), notes=notes, tracks=tracks)
-
-    def _refined_cameras(self, after: pycolmap.Reconstruction) -> tuple[str, ...]:
-        """Lines on how the adjustment to another model changed rigs, focal lengths and principal points."""
-        if not self.moves_calibration:
-            return ()
-        if self.refine == "rig":
-            return self._refined_rigs(after)
-        cameras = self.reconstruction.cameras
-        pairs = [(cameras[key].mean_focal_length(), new.mean_focal_length()) for key, new in after.cameras.items()]
-        ratios: Floats = np.array([new / old for old, new in pairs])
-        low, middle, high = 100 * (np.percentile(ratios, [0, 50, 100]) - 1)
-        told = [f"focal lengths of {len(ratios)} cameras changed by {middle:+.3g} % ({low:+.3g} to {high:+.3g} %)"]
-        if len(ratios) == 1:
-            told = [f"focal length {pairs[0][0]:.6g} → {pairs[0][1]:.6g} px"]
-        if self.refine == "all":
-            shift = [
-                np.hypot(new.principal_point_x - old.principal_point_x, new.principal_point_y - old.principal_point_y)
-                for old, new in ((cameras[key], new) for key, new in after.cameras.items())
-            ]
-            told += [f"principal points moved by {np.median(shift):.3g} px"]
-        return tuple(told)
-
-    def _refined_rigs(self, after: pycolmap.Reconstruction) -> tuple[str, ...]:
-        """A line on how far cameras turned in their rigs, and moved as a share of their distance from its origin."""
-        turns, shifts, distances = list[float](), list[float](), list[float]()
-        for rig_id, rig in self.reconstruction.rigs.items():
-            for sensor, before in rig.non_ref_sensors.items():
-                if before is not None:
-                    moved = after.rigs[rig_id].non_ref_sensors[sensor] * before.inverse()
-                    turns.append(float(np.degrees(moved.rotation.angle())))
-                    shifts.append(float(np.linalg.norm(moved.translation)))
-                    distances.append(float(np.linalg.norm(before.translation)))
-        if not turns:
-            return ()
-        told = f"cameras turned in their rigs by up to {max(turns):.2g}°"
-        return (f"{told} and moved by up to {max(shifts) / max([*distances, 1e-300]):.0%} of the rig",)
 
     def _with(self, reconstruction: pycolmap.Reconstruction, records: Model) -> ColmapModel:
         """The same model of another reconstruction, whose content is known: pycolmap gives it point by point."""
