@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from hodge_adapters.icl_nuim.pov import read_pose, read_ray_lengths
 from hodge_adapters.icl_nuim.reader import IclNuimReader
 from hodge_adapters.images.camera_files import resized
 from hodge_adapters.trajectories.log import read_log_file
+from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.testing import check_reader
@@ -152,7 +154,7 @@ def test_the_redwood_layout(tmp_path: Path) -> None:
     assert source.frames[1].read_colour is None
     np.testing.assert_allclose(source.frames[2].world_from_cam, some_poses(3)[2], atol=1e-7)
     np.testing.assert_allclose(source.frames[1].read_depth(), depth_values(1) / 1000, rtol=1e-6)
-    assert "depth: 1 image without a number left out: readme.png" in source.notes
+    assert "depth: 1 image without an own number left out: readme.png" in source.notes
     assert "1 frame has no colour image: 1" in source.notes
     assert any("an estimate of another program" in note for note in source.notes)
     assert [f.frame_id for f in IclNuimReader(every=2).open(folder).frames] == [0, 2]
@@ -218,3 +220,48 @@ def test_the_authors_images_without_their_list(tmp_path: Path) -> None:
     np.testing.assert_allclose(source.frames[0].read_depth(), depth_values(0) / 5000, rtol=1e-6)
     assert [frame.world_from_cam is not None for frame in source.frames] == [False, True, True]
     assert "no associations.txt: images are paired by the numbers in their names" in source.notes
+
+
+def numbered_folder(folder: Path, depth: str, colour: str, count: int = 3) -> Path:
+    for number in range(count):
+        write_depth(folder / "depth" / depth.format(number), depth_values(number))
+        write_colour(folder / "color" / colour.format(number))
+    return folder
+
+
+def test_the_number_of_a_frame_is_the_one_that_tells_images_apart(tmp_path: Path) -> None:
+    folder = numbered_folder(tmp_path, "d435_{0:04d}_9{0}.png", "cam2_{0:04d}.png")
+    source = IclNuimReader(camera=SMALL).open(folder)
+    assert [frame.frame_id for frame in source.frames] == [0, 1, 2] and not source.doubts
+    assert all(frame.read_colour is not None for frame in source.frames)
+
+
+def test_images_named_without_numbers_or_by_stamps_are_told_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"depth: 3 of 3 images have no number of their own \(a\.png.*put depth"):
+        letters = numbered_folder(tmp_path / "letters", "{}.png", "{}.png")
+        for number, name in enumerate("abc"):
+            (letters / f"depth/{number}.png").rename(letters / f"depth/{name}.png")
+        IclNuimReader(camera=SMALL).open(letters)
+    for name in ("130503110{}.16.png", "130503110{}160407000.png"):
+        stamped = numbered_folder(tmp_path / name, name, name)
+        with pytest.raises(SourceError, match="named by their stamps: .*hodge run tum"):
+            IclNuimReader(camera=SMALL).open(stamped)
+        assert TumReader().sniff(stamped).confidence > IclNuimReader().sniff(stamped).confidence
+        source = TumReader().open(stamped)
+        assert [frame.stamp_s for frame in source.frames] == pytest.approx([1305031100.16 + row for row in range(3)])
+        assert all(frame.read_colour is not None for frame in source.frames), "color/ in the place of rgb/"
+
+
+def test_colour_numbered_otherwise_than_depth_is_a_doubt(tmp_path: Path) -> None:
+    source = IclNuimReader(camera=SMALL).open(numbered_folder(tmp_path, "{}.png", "100{}.png"))
+    assert [(note.kind, note.count, note.detail) for note in source.doubts] == [("colour unpaired", 3, "3")]
+
+
+def test_the_camera_and_the_depth_scale_of_open3d_s_recordings(tmp_path: Path) -> None:
+    folder = numbered_folder(tmp_path, "{}.png", "{}.png")
+    matrix = [10, 0, 0, 0, 10, 0, 3.5, 2.5, 1]
+    told = {"width": 8, "height": 6, "intrinsic_matrix": matrix, "depth_scale": 4000.0}
+    (folder / "intrinsic.json").write_text(json.dumps(told))
+    source = IclNuimReader().open(folder)
+    assert source.frames[0].camera == Camera(8, 6, 10.0, 10.0, 3.5, 2.5) and source.frames[1].read_depth is not None
+    np.testing.assert_allclose(source.frames[1].read_depth(), depth_values(1) / 4000, rtol=1e-6)

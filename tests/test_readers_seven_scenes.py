@@ -127,6 +127,7 @@ def test_frames_that_lack_an_image(sequence: Path) -> None:
     assert [(f.frame_id, f.read_colour is None) for f in source.frames] == [(1, False), (2, True)]
     assert "1 frame without a depth image left out: seq-01/000000" in source.notes
     assert "1 frame has no colour image: seq-01/000002" in source.notes
+    assert [(note.kind, note.count, note.detail) for note in source.doubts] == [("images missing", 1, "3 depth images")]
 
 
 def test_a_bad_image_is_found_on_reading_and_not_before(sequence: Path) -> None:

@@ -172,6 +172,8 @@ def test_lost_frames_and_missing_images_come_first_where_they_are_most(report: R
     ]
     assert headlines[0].startswith("Improved against")
     assert headlines[1] == "Tracking was lost at 11 of 20 frames: improved against odometry"
+    unread = replace(report, notes=(Note("images unread", 11, "(0–10)"), *report.notes))
+    assert judge(unread).headline.startswith("11 of 20 frames have images that cannot be read: improved")
     missing = replace(
         report, notes=(Note("tracking lost", 20, "0–19"), Note("images missing", 980, "997 listed images"))
     )

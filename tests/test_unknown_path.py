@@ -56,6 +56,11 @@ def test_images_of_another_format_are_told_what_to_become(tmp_path: Path) -> Non
     assert "convert 0.pgm" in complaint(tmp_path / "depth") and "convert 0.pgm" in complaint(tmp_path / "depth/0.pgm")
 
 
+def test_images_in_an_unknown_layout_are_told_which_is_known(tmp_path: Path) -> None:
+    (tmp_path / "depth_0001.png").write_bytes(b"")
+    assert "put depth (PNG of 16 bits, millimetres) in depth/ and colour in color/" in complaint(tmp_path)
+
+
 def test_a_folder_of_many_sources_names_a_few(tmp_path: Path) -> None:
     for number in range(200):
         (tmp_path / f"{number:03}.g2o").write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")

@@ -14,6 +14,8 @@ NEIGHBOURS = 4
 JUMP, FEWEST_OF_RUN = 10.0, 10
 """Usual steps by which a clock jumps back, and stamps to a jump: more of either are stamps out of order."""
 
+MISSING = 0.1
+"""The share of the images from which it is a doubt that they are missing: a sequence loses single ones."""
 UNPAIRED = 0.6
 """The share of depth images without colour from which it is a doubt: colour at half the rate leaves half, and a few."""
 

@@ -38,13 +38,14 @@ REFINEMENTS: dict[str, Outcome] = {
 }  # fmt: skip
 LEADS = {
     "images missing": "{count} of {detail} are missing",
-    "colour unpaired": "{count} of {detail} depth images have no colour image near in time",
+    "colour unpaired": "{count} of {detail} depth images have no colour image of their time or number",
     "other scale": "in another scale than the truth",
     "truth convention": "the truth seems to be in another convention",
     "truth clock": "{detail}",
     "truth unlike": "still poses would explain the registered motion better than the truth",
     "unsettled": "not settled",
     "tracking lost": "tracking was lost at {count} of {frames} frames",
+    "images unread": "{count} of {frames} frames have images that cannot be read",
 }
 REASONS = {
     "camera or object": "images contradict the camera's motion",
@@ -62,8 +63,9 @@ REASONS = {
     "left apart": "a guess joins what tracking left apart",
     "wrong": "edges that it uses are judged wrong",
 }
-"""By kind of note, what a headline begins with (`LEADS`; lost frames from `MOSTLY_LOST` on), and the reasons of `in
-doubt, since …` (`REASONS`), whatever the measures say."""
+"""By kind of note, what a headline begins with (`LEADS`; those `OF_MOST` frames from `MOSTLY_LOST` on), and the reasons
+of `in doubt, since …` (`REASONS`), whatever the measures say."""
+OF_MOST = {"tracking lost", "images unread"}
 MOSTLY_LOST = 0.5
 """The share of the frames."""
 GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
@@ -123,7 +125,7 @@ def judge(report: Report) -> Verdict:
     doubts = [
         LEADS[note.kind].format(count=note.count, detail=note.detail, frames=frames)
         for note in told
-        if note.kind in LEADS and (note.kind != "tracking lost" or note.count > MOSTLY_LOST * frames)
+        if note.kind in LEADS and (note.kind not in OF_MOST or note.count > MOSTLY_LOST * frames)
     ]
     doubts += [f"in doubt, since {reasons}"] if reasons else []
     doubts += [report.refinement.doubt] if report.refinement and report.refinement.doubt else []

@@ -18,6 +18,12 @@ IMAGES, AS_PNG = "images are read as PNG or JPEG", "to PNG, depth with all 16 bi
 DEPTH = 3
 NAMED = 3
 UNREAD_IMAGES = (".pgm", ".ppm", ".tif", ".tiff", ".bmp", ".exr", ".webp")
+READ_IMAGES = (".png", ".jpg", ".jpeg")
+UNKNOWN_LAYOUT = (
+    "images in a layout that no reader knows: put depth (PNG of 16 bits, millimetres) in depth/ and colour in color/, "
+    "both named by one number, 00000.png, …, and `fx fy cx cy` in intrinsics.txt beside them; photographs without "
+    "depth need a COLMAP model"
+)
 PACKED = (".zip", ".7z", ".rar", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst")
 
 
@@ -60,7 +66,9 @@ def _problem(path: Path) -> str:
         return f"holds packed files: unpack {packed[0]} first"
     files = [*children, *(file for child in children if child.is_dir() for file in _children(child))]
     image = next((file for file in files if file.suffix.lower() in UNREAD_IMAGES), None)
-    return "" if image is None else f"{IMAGES}: convert {image.relative_to(path)} and its like {AS_PNG}"
+    if image is not None:
+        return f"{IMAGES}: convert {image.relative_to(path)} and its like {AS_PNG}"
+    return UNKNOWN_LAYOUT if any(file.suffix.lower() in READ_IMAGES for file in files) else ""
 
 
 def without_frames(source: Source) -> str:

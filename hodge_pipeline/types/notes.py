@@ -22,8 +22,8 @@ INPUTS = {
     "input changed": "{count} {count:file|files} of the input changed while the run read {count:it|them} ({detail}): "
     "run the same command again once {count:it stays as it is|they stay as they are}.",
     "images missing": "{count} of {detail} are missing: unpack or copy the whole sequence",
-    "colour unpaired": "{count} of {detail} depth images have no colour image near in time, although there are colour "
-    "images: are their stamps of one clock (source.reader.max_difference_s)?",
+    "colour unpaired": "{count} of {detail} depth images have no colour image of their time or number, although there "
+    "are colour images: are both stamped by one clock (source.reader.max_difference_s), or numbered alike?",
     "reader's doubt": "{detail}",
     "depth unit": "Depth is probably not in metres: {detail}.",
     "depth steps": "depth is of another sensor than a Kinect, Xtion, Astra or Structure sensor, or in another unit: "

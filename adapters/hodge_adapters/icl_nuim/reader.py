@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from hodge_adapters.association import unpaired_doubts
 from hodge_adapters.icl_nuim.pov import list_pov, pov_frames
 from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
 from hodge_adapters.images.fitted_camera import UNSTAMPED_STEP_S, assumed_camera_doubts
@@ -20,26 +21,31 @@ from hodge_adapters.seven_scenes.files import FrameFiles, read_poses
 from hodge_adapters.text_rows import first_text, listed, names_in
 from hodge_adapters.trajectories.log import read_log_file
 from hodge_adapters.trajectories.text import parse_tum
-from hodge_adapters.tum.image_lists import StampedImages, find_association_file, read_pairs
+from hodge_adapters.tum.image_lists import (
+    StampedImages,
+    find_association_file,
+    find_colour_folder,
+    read_pairs,
+    stamped_images,
+)
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Frame, Source
-from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.text import counted
 
 ICL = Intrinsics(481.2, -480.0, 319.5, 239.5, (640, 480))
 REDWOOD = Intrinsics(525.0, 525.0, 319.5, 239.5, (640, 480))
 ICL_UNITS_PER_METRE, REDWOOD_UNITS_PER_METRE = 5000.0, 1000.0
+LAYOUT = "put depth (PNG of 16 bits) in depth/ and colour in color/, both named by one number, 00000.png, …"
 TRUTH_PATTERN = "*.gt.freiburg*"
 MAX_GAP_FRAMES = 1.0
 VIDEO_HZ = 30.0
 """Frames are rendered at this rate along a walked path."""
 SNIFFED_BYTES = 1 << 16
-COLOUR_FOLDERS = ("image", "images", "color", "rgb")
 LOG_FILES = ("trajectory.log", "scene/trajectory.log", "test_scene/trajectory.log")
 TUM_FILES = ("depth.txt", "rgb.txt", "groundtruth.txt")
-_NUMBER = re.compile(r"\D*(\d{1,18})(?!\d)")
+_NUMBER = re.compile(r"(?<!\d)\d{1,18}(?!\d)")
 _IMAGES = (".png", ".jpg", ".jpeg")
 
 
@@ -103,7 +109,7 @@ class IclNuimReader:
         if is_redwood(path):
             return self._open_unlisted(path) if _find_truth(path) else self._open_redwood(path)
         raise SourceError(
-            f"{path}: no associations.txt, no scene_00_0000.depth, no depth/ beside image/ or color/ in it"
+            f"{path}: no associations.txt, no scene_00_0000.depth, no depth/ beside image/ or color/ in it: {LAYOUT}"
         )
 
     def _camera(self, default: Intrinsics) -> Intrinsics:
@@ -152,7 +158,8 @@ class IclNuimReader:
         *,
         is_true: bool,
     ) -> tuple[Frame, ...]:
-        camera, scale = self._camera(default).camera_of(listing.depth, notes), self.depth_scale or units_per_metre
+        camera = self._camera(default).camera_of(listing.depth, notes)
+        scale = self.depth_scale or default.units_per_metre or units_per_metre
         return listing.frames(camera, poses, self.every, notes, units_per_metre=scale, is_true=is_true)
 
     def _open_pov(self, path: Path, pov: dict[int, Path]) -> Source:
@@ -179,10 +186,10 @@ class IclNuimReader:
         own = None if self.camera else find_camera_file(path)
         if own:
             notes.append(f"intrinsics from {own.relative_to(path)}")
-        doubts: tuple[Note, ...] = ()
+        doubts = listing.doubts
         if own is None and not self.camera:
             stamps_s, scale = UNSTAMPED_STEP_S * listing.stamps_s, self.depth_scale or REDWOOD_UNITS_PER_METRE
-            doubts = assumed_camera_doubts(REDWOOD, listing.depth, listing.colour, stamps_s, scale)
+            doubts += assumed_camera_doubts(REDWOOD, listing.depth, listing.colour, stamps_s, scale)
             notes.append(
                 "Redwood's intrinsics taken (525 525 319.5 239.5), since there is no camera file in the folder"
             )
@@ -228,26 +235,30 @@ def is_redwood(folder: Path) -> bool:
     """Whether the folder has a depth and a colour folder, and no list or truth of a TUM sequence."""
     if any((folder / name).is_file() for name in TUM_FILES):
         return False
-    has_colour = any((folder / name).is_dir() for name in COLOUR_FOLDERS)
-    return has_colour and (folder / "depth").is_dir()
+    return find_colour_folder(folder) is not None and (folder / "depth").is_dir()
 
 
 def list_images(folder: Path, notes: list[str]) -> StampedImages:
-    """The images of a folder by the number that their names start with, their stamp; depth without colour is noted."""
+    """The images of a folder by the number in their names, their stamp; depth without colour is noted."""
+    if stamped_images(folder / "depth"):
+        raise SourceError(
+            f"{folder / 'depth'}: its images are named by their stamps: read them with the reader tum (hodge run tum), "
+            "and set source.reader.depth_scale=1000 if depth is in millimetres"
+        )
     depth = _by_number(folder / "depth", notes)
     if not depth:
-        raise SourceError(
-            f"{folder / 'depth'}: no numbered PNG in it: give the folder with depth/ and image/ or color/"
-        )
-    colour_folder = next((folder / name for name in COLOUR_FOLDERS if (folder / name).is_dir()), None)
+        raise SourceError(f"{folder / 'depth'}: no PNG in it: {LAYOUT}")
+    colour_folder = find_colour_folder(folder)
     colour = _by_number(colour_folder, notes) if colour_folder else {}
     numbers = sorted(depth)
     alone = [number for number in numbers if number not in colour]
     if alone:
         notes.append(f"{counted(len(alone), 'frame has|frames have')} no colour image: {listed(alone)}")
+    doubts = unpaired_doubts([number in colour for number in numbers]) if colour else ()
     none_s, one_run = np.zeros(len(numbers)), np.zeros(len(numbers), np.int64)
     stamps_s = np.array(numbers, float)
-    return StampedImages(stamps_s, [depth[n] for n in numbers], [colour.get(n) for n in numbers], none_s, (), one_run)
+    images = [depth[number] for number in numbers], [colour.get(number) for number in numbers]
+    return StampedImages(stamps_s, *images, none_s, (), one_run, doubts)
 
 
 def find_log(folder: Path) -> Path | None:
@@ -256,15 +267,26 @@ def find_log(folder: Path) -> Path | None:
 
 
 def _by_number(folder: Path, notes: list[str]) -> dict[int, Path]:
+    """The images of a folder by the first of the numbers in their names that tells most of them apart, so that
+    `d435_0001.png` is 1. Raises `SourceError` where most have none of their own.
+    """
     names = [name for name in names_in(folder) if name.lower().endswith(_IMAGES)]
+    numbers = [[int(digits) for digits in _NUMBER.findall(Path(name).stem)] for name in names]
+    places = range(max(map(len, numbers), default=0))
+    place = max(places, key=lambda place: len({each[place] for each in numbers if place < len(each)}), default=0)
     found: dict[int, Path] = {}
     skipped: list[str] = []
-    for name in names:
-        match = _NUMBER.match(name)
-        if match is None or int(match[1]) in found:
+    for name, each in zip(names, numbers, strict=True):
+        if place >= len(each) or each[place] in found:
             skipped.append(name)
         else:
-            found[int(match[1])] = folder / name
+            found[each[place]] = folder / name
+    if len(skipped) > len(found):
+        raise SourceError(
+            f"{folder}: {len(skipped)} of {len(names)} images have no number of their own ({listed(skipped)}), by "
+            f"which depth and colour are paired: {LAYOUT}"
+        )
     if skipped:
-        notes.append(f"{folder.name}: {counted(len(skipped), 'image')} without a number left out: {listed(skipped)}")
+        left_out = counted(len(skipped), "image")
+        notes.append(f"{folder.name}: {left_out} without an own number left out: {listed(skipped)}")
     return found

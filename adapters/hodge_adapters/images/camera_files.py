@@ -11,7 +11,7 @@ from typing import Any
 
 from hodge_adapters.images.headers import MAX_SIDE
 from hodge_adapters.images.pixels import common_size, same_shape
-from hodge_adapters.json_files import numbers, read_json, whole
+from hodge_adapters.json_files import number, numbers, read_json, whole
 from hodge_adapters.text_rows import read_rows, read_text, to_floats
 from hodge_pipeline.errors import CameraError, SourceError
 from hodge_pipeline.types import Camera
@@ -28,6 +28,8 @@ CAMERA_FILES = (
     "calibration.yaml",
     "calibration.txt",
     "camera_intrinsic.json",
+    "camera_intrinsics.json",
+    "intrinsic.json",
     "intrinsic/intrinsic_depth.txt",
     "K.txt",
     "info.txt",
@@ -35,7 +37,8 @@ CAMERA_FILES = (
     "TUM2.yaml",
     "TUM3.yaml",
 )
-"""Usual names, also of Open3D, ScanNet's exporter, deep-video-mvs, BundleFusion and ORB-SLAM."""
+"""Usual names, also of Open3D, whose recordings of a RealSense or an Azure Kinect have `intrinsic.json`, ScanNet's
+exporter, deep-video-mvs, BundleFusion and ORB-SLAM."""
 LONGEST_READOUT_S = 1.0
 """Upper bound on a rolling shutter's read-out time: slower cameras give no video."""
 _SUPPORTED = "`fx fy cx cy [width height]` on one line, a 3x3 matrix, `fx: …` lines, or Open3D's JSON"
@@ -201,7 +204,8 @@ def _distortion(values: dict[str, float]) -> tuple[float, float, float, float, f
 
 
 def _from_json(path: Path) -> Intrinsics:
-    """Open3D's `camera_intrinsic.json`: the matrix is stored by columns."""
+    """Open3D's `camera_intrinsic.json`: the matrix is stored by columns; its recordings have a `depth_scale` too."""
     content = read_json(path)
     matrix = numbers(content.get("intrinsic_matrix"), 9, f"{path}: intrinsic_matrix").tolist()
-    return Intrinsics(matrix[0], matrix[4], matrix[6], matrix[7], _size(content.get("width"), content.get("height")))
+    size = _size(content.get("width"), content.get("height"))
+    return Intrinsics(matrix[0], matrix[4], matrix[6], matrix[7], size, number(content.get("depth_scale")))

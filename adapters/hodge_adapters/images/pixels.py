@@ -43,7 +43,10 @@ def read_depth(
     stored = _decoded(path, size, cv2.IMREAD_UNCHANGED)
     if stored.ndim != 2 or stored.dtype != np.uint16:
         kind = f"{stored.dtype} with {1 if stored.ndim == 2 else stored.shape[2]} channel(s)"
-        raise SourceError(f"{path}: depth must be uint16 with one channel, this is {kind}: is it a colour image?")
+        raise SourceError(
+            f"{path}: depth must be uint16 with one channel, this is {kind}: a colour image, or a picture of depth? "
+            "Export depth as PNG of 16 bits"
+        )
     depth_m: Floats32 = stored.astype(np.float32)
     depth_m *= np.float32(1.0 / units_per_metre)
     for value in no_depth:
@@ -94,9 +97,10 @@ def read_whole_image(path: Path, size: tuple[int, int] | None = None, any_scale:
     header = parse_header(contents, path)
     found = header.width, header.height
     if size is not None and found != size and not (any_scale and same_shape(found, size)):
+        registered = "record depth registered (aligned) to colour, or " if any_scale else ""
         raise SourceError(
             f"{path}: the image is {header.width}x{header.height}, the camera {size[0]}x{size[1]}: "
-            "give the intrinsics of this image, or leave the frame out"
+            f"{registered}give the intrinsics of this image, or leave the frame out"
         )
     if not is_complete(contents, header):
         raise SourceError(f"{path}: the image is truncated or damaged: copy it again from its source")

@@ -11,10 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from hodge_adapters.association import MISSING, unpaired_doubts
 from hodge_adapters.text_rows import listed, names_in, read_rows, read_text, to_floats
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
+from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.text import counted
 
 SPLIT_FILES = {"train": "TrainSplit.txt", "test": "TestSplit.txt"}
@@ -75,8 +77,10 @@ def split_numbers(path: Path, split: str) -> set[int]:
     return numbers
 
 
-def with_depth(path: Path, chosen: Sequence[tuple[str, Path]], notes: list[str]) -> list[FrameFiles]:
-    """The frames that have a depth image, ranked within their sequence; the others are noted."""
+def with_depth(
+    path: Path, chosen: Sequence[tuple[str, Path]], notes: list[str]
+) -> tuple[list[FrameFiles], tuple[Note, ...]]:
+    """The frames that have a depth image, ranked within their sequence; the others are noted, and many a doubt."""
     usable: list[FrameFiles] = []
     missing: list[str] = []
     for name, folder in chosen:
@@ -98,7 +102,10 @@ def with_depth(path: Path, chosen: Sequence[tuple[str, Path]], notes: list[str])
     colourless = [f"{files.sequence}/{files.number:06d}" for files in usable if "color" not in files.paths]
     if colourless:
         notes.append(f"{counted(len(colourless), 'frame has|frames have')} no colour image: {listed(colourless)}")
-    return usable
+    total = len(usable) + len(missing)
+    lost = (Note("images missing", len(missing), f"{total} depth images"),) * (len(missing) > MISSING * total)
+    unpaired = unpaired_doubts(["color" in files.paths for files in usable]) if len(colourless) < len(usable) else ()
+    return usable, (*lost, *unpaired)
 
 
 def _list_numbers(folder: Path) -> dict[int, dict[str, Path]]:

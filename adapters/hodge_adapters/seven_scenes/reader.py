@@ -96,7 +96,7 @@ class SevenScenesReader:
         """
         path = Path(path)
         notes: list[str] = []
-        usable = with_depth(path, self._chosen(path, notes), notes)
+        usable, doubts = with_depth(path, self._chosen(path, notes), notes)
         camera, camera_files = self._camera(path, usable, notes)
         colours = [files.paths.get("color") for files in usable]
         colour_size = pixels.colour_size(colours, (camera.width, camera.height), notes)
@@ -112,6 +112,7 @@ class SevenScenesReader:
             ),
             trajectory=None if several else _trajectory(usable, poses),
             notes=tuple(notes),
+            doubts=doubts,
             numbered_hz=VIDEO_HZ,
             files=(*camera_files, *(file for files in usable for file in sorted(files.paths.values()))),
         )

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hodge_adapters.association import clock_runs, nearest_in_runs, unpaired_doubts
+from hodge_adapters.association import MISSING, clock_runs, nearest_in_runs, unpaired_doubts
 from hodge_adapters.images import pixels
 from hodge_adapters.images.frames import image_frame
 from hodge_adapters.text_rows import Row, inside, listed, read_rows, to_floats
@@ -22,9 +22,9 @@ from hodge_pipeline.types.text import counted
 ASSOCIATION_FILES = ("associations.txt", "association.txt", "associate.txt", "associated.txt")
 LONGEST_DELAY_S = 0.1
 """Between the images of one frame: stamps further apart are not of one clock."""
-MISSING = 0.1
-"""The share of the listed images from which it is a doubt that they are missing: a sequence loses single ones."""
-_STAMP_NAME = re.compile(r"\d+\.\d+\.(png|jpg|jpeg)", re.IGNORECASE)
+COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images")
+_STAMP_NAME = re.compile(r"(\d+\.\d+|[1-9]\d{11,17}|[1-4]\d{18})\.(png|jpg|jpeg)", re.IGNORECASE)
+"""Seconds with a fraction, or milliseconds to nanoseconds since 1970: no sequence has so many frames."""
 _DEPTH_NAME = re.compile(r"depth", re.IGNORECASE)
 
 
@@ -120,7 +120,9 @@ def _from_lists(folder: Path, max_difference_s: float, notes: list[str]) -> Stam
             "folder that holds them, or unpack the whole sequence"
         )
     lists = tuple(path for path in (depth_list, colour_list) if path.is_file())
-    colour_stamps_s, colour, colour_runs = _listed_or_named(colour_list, folder / "rgb", notes)
+    colour_stamps_s, colour, colour_runs = _listed_or_named(
+        colour_list, find_colour_folder(folder) or folder / "rgb", notes
+    )
     if not colour and not colour_list.is_file():
         notes.append("no rgb.txt: frames have no colour")
         return StampedImages(depth_stamps_s, depth, [None] * len(depth), np.zeros(len(depth)), lists, runs)
@@ -141,12 +143,18 @@ def _from_lists(folder: Path, max_difference_s: float, notes: list[str]) -> Stam
 
 
 def stamped_images(folder: Path) -> list[tuple[float, Path]]:
-    """The images of a folder whose names are stamps with a fraction, as TUM names them; none where there are none."""
+    """The images of a folder whose names are stamps, ascending: seconds with a fraction, as TUM names them, or whole
+    milliseconds to nanoseconds since 1970; none where there are none.
+    """
     try:
-        names = sorted(path for path in folder.iterdir() if _STAMP_NAME.fullmatch(path.name))
+        return sorted((float(path.stem), path) for path in folder.iterdir() if _STAMP_NAME.fullmatch(path.name))
     except OSError:
         return []
-    return [(float(path.stem), path) for path in names]
+
+
+def find_colour_folder(folder: Path) -> Path | None:
+    """The folder of colour images, by its usual names."""
+    return next((folder / name for name in COLOUR_FOLDERS if (folder / name).is_dir()), None)
 
 
 def _listed_or_named(path: Path, images: Path, notes: list[str]) -> tuple[Floats, list[Path], Ints]:
@@ -156,7 +164,8 @@ def _listed_or_named(path: Path, images: Path, notes: list[str]) -> tuple[Floats
     found = stamped_images(images)
     if found:
         notes.append(f"no {path.name}: the stamps of {len(found)} images are those of their names in {images.name}/")
-    return np.array([stamp for stamp, _ in found]), [image for _, image in found], np.zeros(len(found), np.int64)
+    stamps_s = in_seconds(np.array([stamp for stamp, _ in found]), f"{images.name}/", notes)
+    return stamps_s, [image for _, image in found], np.zeros(len(found), np.int64)
 
 
 def _read_list(path: Path, notes: list[str]) -> tuple[Floats, list[Path], Ints]:
