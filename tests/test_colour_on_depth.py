@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 from hodge_adapters.seven_scenes.reader import SevenScenesReader
+from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.sources.colour_on_depth import image_doubts
-from hodge_pipeline.types import Bytes, Camera, Floats32, Frame
+from hodge_pipeline.store.store import Store
+from hodge_pipeline.types import Bytes, Camera, Floats32, Frame, Source
 from hodge_pipeline.types.notes import Note
+from hodge_pipeline.uses.recipe_run import _Run
 
 WIDTH, HEIGHT = 320, 240
 
@@ -30,7 +33,11 @@ def boxes(seed: int) -> tuple[Floats32, Bytes]:
 
 
 def doubts(scale: float, right: float, count: int = 6) -> tuple[Note, ...]:
-    """On frames whose depth is to be scaled and shifted to lie on colour."""
+    return image_doubts(boxes_beside(scale, right, count))
+
+
+def boxes_beside(scale: float, right: float, count: int = 6) -> list[Frame]:
+    """Frames whose depth is to be scaled and shifted to lie on colour."""
     to_depth = np.array([[1 / scale, 0, WIDTH / 2 * (1 - 1 / scale) - right / scale], [0, 1, 0]])
     to_depth[1] = [0, 1 / scale, HEIGHT / 2 * (1 - 1 / scale)]
     camera, frames = Camera(WIDTH, HEIGHT, 260.0, 260.0, 159.5, 119.5), []
@@ -38,7 +45,7 @@ def doubts(scale: float, right: float, count: int = 6) -> tuple[Note, ...]:
         depth_m, colour = boxes(number)
         warped = cv2.warpAffine(depth_m, to_depth, (WIDTH, HEIGHT), flags=cv2.INTER_NEAREST)
         frames.append(Frame(number, number / 30, camera, partial(np.copy, warped), partial(np.copy, colour)))
-    return image_doubts(frames)
+    return frames
 
 
 @pytest.mark.parametrize(("scale", "right"), [(1.0, 0.0), (1.02, 3.0)])
@@ -52,6 +59,17 @@ def test_depth_beside_colour_is_told(scale: float, right: float) -> None:
     assert note.kind == "colour beside depth"
     assert note.detail == f"scaled by {scale:.2f} and shifted by {right:.0f} and 0 pixels"
     assert doubts(scale, right, count=4) == ()
+
+
+@pytest.mark.parametrize(("right", "is_used"), [(0.0, True), (14.0, False)])
+def test_a_run_places_frames_by_surfaces_alone_where_colour_is_not_on_depth(
+    tmp_path: Path, right: float, is_used: bool
+) -> None:
+    store = Store(tmp_path)
+    opened = Source("boxes", tmp_path, boxes_beside(1.0, right))
+    source, _ = _Run(load_recipe("tum", source=tmp_path), tmp_path, store, opened=opened)._read()
+    assert [frame.read_colour is not None for frame in source.frames] == [is_used] * 6
+    assert all(frame.read_depth is not None for frame in source.frames)
 
 
 def test_a_real_kinect(data_dir: Path) -> None:

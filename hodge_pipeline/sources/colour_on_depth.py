@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.depth_units import SAMPLED_FRAMES, doubts_of
-from hodge_pipeline.types import Bytes, Floats, Floats32, Frame
+from hodge_pipeline.types import Bytes, Floats, Floats32, Frame, Source
 from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.image_edges import FEWEST_EDGES, change_along_rows, depth_edges
 from hodge_pipeline.types.notes import Note
@@ -58,6 +58,15 @@ def image_doubts(frames: Sequence[Frame]) -> tuple[Note, ...]:
             continue
     units = doubts_of(np.concatenate([depth_m.ravel() for depth_m in values])) if values else ()
     return (*units, *colour_doubts(found))
+
+
+def usable_colour(source: Source, doubts: Sequence[Note]) -> Source:
+    """The source, its frames without colour where that is doubted to lie on depth: landmarks then have the depth of
+    other things, and place frames worse than surfaces alone. The images are still shown as they are stored.
+    """
+    if not any(doubt.kind == "colour beside depth" for doubt in doubts):
+        return source
+    return replace(source, frames=[replace(frame, read_colour=None) for frame in source.frames])
 
 
 def colour_doubts(found: Sequence[Agreement]) -> tuple[Note, ...]:

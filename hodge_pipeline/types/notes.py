@@ -30,7 +30,8 @@ INPUTS = {
     "{detail}",
     "depth range": "{detail}: is the depth scale right (source.reader.depth_scale)?",
     "colour beside depth": "Depth seems not to be registered to colour: edges of both agree better with depth "
-    "{detail}. Record depth registered (aligned) to colour, or give the images of one camera and one moment.",
+    "{detail}. Surfaces alone place frames. Record depth registered (aligned) to colour, or give the images of one "
+    "camera and one moment.",
     "focal length": "The camera's intrinsics are probably wrong: what frames saw of each other fits a focal length of "
     "{detail} (source.reader.camera, or the file it is read from).",
     "millimetres": "{detail}",

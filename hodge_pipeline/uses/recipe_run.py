@@ -16,7 +16,7 @@ from hodge_pipeline.recording.run import Recording
 from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.report import run_files
 from hodge_pipeline.run_folder import Run, check_layout, end
-from hodge_pipeline.sources.colour_on_depth import image_doubts
+from hodge_pipeline.sources.colour_on_depth import image_doubts, usable_colour
 from hodge_pipeline.sources.lacking import check_measurable, lacking
 from hodge_pipeline.sources.opening import Fingerprints, changed_since, fingerprints, open_with_reader, remembered
 from hodge_pipeline.start.truth import with_truth
@@ -125,7 +125,9 @@ class _Run:
             raise SourceError(f"{path}: has no frames to register: give a sequence with depth or clouds")
         check_measurable(source)
         self.store.note(*notes_of("reader", source.notes), *source.doubts)
-        self.store.note(*image_doubts(source.frames), *lacking(source))
+        doubts = image_doubts(source.frames)
+        self.store.note(*doubts, *lacking(source))
+        source = usable_colour(source, doubts)
         if len(source.frames) == 1:
             self.store.note(Note("single frame", detail=str(path)))
         prints = fingerprints(source.files, strict=self.strict)
