@@ -21,8 +21,8 @@ from hodge_adapters.colmap.tracked import ColmapModel
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.evaluation.trajectory import absolute_error
-from hodge_pipeline.refine import choice
-from hodge_pipeline.refine.candidates import ADJUSTED, GIVEN, POINTS
+from hodge_pipeline.refine import candidates, choice
+from hodge_pipeline.refine.candidates import ADJUSTED, GIVEN, POINTS, RESECTED, adjusted_model
 from hodge_pipeline.refine.frame import in_frame_of
 from hodge_pipeline.stages import Step
 
@@ -34,7 +34,9 @@ def test_disturbed_poses_come_back_with_every_rig_name_and_track(tmp_path: Path,
     given = "auto" if database else "none"
     done = hodge_pipeline.refine_colmap(start, database=given, out=tmp_path / "out", overrides=FREE)
     assert done.exit_code == 0 and done.results[0].decision.outcome == "refined"
-    assert [name for name, _ in done.results[0].candidates][:3] == [GIVEN, POINTS, ADJUSTED]
+    assert [name for name, _ in done.results[0].candidates] == [GIVEN, RESECTED], (
+        "no other is as cheap or can be better"
+    )
     before, after = pycolmap.Reconstruction(model), pycolmap.Reconstruction(tmp_path / "out/sparse/0")
     assert error_px(start) > 3 and error_px(tmp_path / "out/sparse/0") <= 1.001 * error_px(model)
     assert tracks(after) == tracks(before)
@@ -105,8 +107,12 @@ def test_wrong_tracks_do_not_bend_the_model(tmp_path: Path, share: float) -> Non
     assert off[1] < 0.05 * off[0]
 
 
-def test_points_that_are_wrong_beside_right_poses_are_mended_alone(tmp_path: Path) -> None:
+def test_points_that_are_wrong_beside_right_poses_are_mended_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However well tracks fix other poses: no points need them."""
     model, rng = pycolmap.Reconstruction(noisy(tmp_path)), np.random.default_rng(0)
+    monkeypatch.setattr(candidates, "told_apart", lambda *_: True)
     before = {key: frame.rig_from_world.matrix() for key, frame in model.frames.items()}
     for point in model.points3D.values():
         point.xyz = point.xyz + rng.normal(scale=0.2, size=3)
@@ -232,6 +238,32 @@ def test_an_adjustment_near_its_optimum_takes_few_steps(tmp_path: Path, monkeypa
         np.testing.assert_allclose(found.quality.errors_px, other.quality.errors_px, atol=1e-4)
     assert steps[0] <= 8, "it goes on among rounding errors"
     assert 2 * steps[2] <= steps[3], "its first steps are short"
+
+
+@pytest.mark.parametrize(("off", "near"), [(0.0, True), (0.05, False)])
+def test_poses_that_make_a_model_sound_are_near_its_optimum(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, off: float, near: bool
+) -> None:
+    told: list[bool] = []
+
+    def adjusted(self: ColmapModel, priors: object, *, near_optimum: bool) -> ColmapModel:
+        told.append(near_optimum)
+        return self
+
+    monkeypatch.setattr(ColmapModel, "adjusted", adjusted)
+    (model,) = ColmapModels().open_models(noisy(tmp_path))
+    xi = off * np.random.default_rng(0).normal(size=(len(model.body_names), 6))
+    adjusted_model(model, model.world_from_body @ se3.exp(xi), None, step=Step(tmp_path, Mock(), Mock()))
+    assert told == [near]
+
+
+def test_poses_that_tracks_hardly_fix_are_set_beside_those_of_the_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = disturbed(noisy(tmp_path), tmp_path / "start")
+    monkeypatch.setattr(candidates, "told_apart", lambda *_: False)
+    (result,) = hodge_pipeline.refine_colmap(start, database="none", overrides=FREE).results
+    assert [name for name, _ in result.candidates][:4] == [GIVEN, POINTS, ADJUSTED, RESECTED]
 
 
 def spoil(monkeypatch: pytest.MonkeyPatch) -> None:

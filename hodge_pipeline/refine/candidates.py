@@ -13,7 +13,8 @@ from hodge_pipeline.refine.frame import in_frame_of
 from hodge_pipeline.refine.model_edges import DepthEdges, depth_edges, no_depth_edges
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_solve import Solved, position_priors, solve_bodies
-from hodge_pipeline.refine.reprojection_cost import SAME_COST, ReprojectionCost, best, costs
+from hodge_pipeline.refine.reprojection_cost import SAME_COST, ReprojectionCost, best, costs, mends
+from hodge_pipeline.refine.uncertainty import told_apart
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.types import Bools, Floats, PositionPriors, ViewGraph
 from hodge_pipeline.types.tracked_model import TrackedModel
@@ -115,6 +116,21 @@ class _Candidates:
         given, adjusted = self.costs[0], self.costs[-1]
         return given.is_sound and abs(adjusted.px - given.px) <= SAME_COST * given.px
 
+    @property
+    def is_mended(self) -> bool:
+        """Whether the last candidate is sound and surely better than any points at the input's poses.
+
+        From a start as far off, other adjustments go on for hundreds of steps and end at the same optimum or a worse
+        one. Where the rays of the input's poses meet stands for the points that an adjustment of these alone would
+        find: both have as many observations beyond the cap.
+        """
+        last, model = self.costs[-1], self.candidates[-1].model
+        if len(self.costs) < 2 or not last.is_sound:
+            return False
+        held = self._start.moved(self._start.world_from_body).quality
+        _, before, after = costs(self._inputs, [held, model.quality])
+        return not before.is_sound and mends(before, after) and told_apart(self._start, model)
+
     def add(
         self,
         name: str,
@@ -123,7 +139,6 @@ class _Candidates:
         priors: PositionPriors | None = None,
         *,
         move_bodies: bool = True,
-        near_optimum: bool = False,
         row: int | None = None,
     ) -> None:
         """Adjust a model, as a step, from its own poses or from these (B, 4, 4), or its points alone; a failure is a
@@ -131,7 +146,7 @@ class _Candidates:
         """
         start = model, poses, priors or self._known
         try:
-            found = self._steps.step(adjusted_model, *start, move_bodies, near_optimum, title=name)
+            found = self._steps.step(adjusted_model, *start, move_bodies, title=name)
         except SourceError as error:
             self.notes.append(f"{name}: {error}")
             return
@@ -157,19 +172,20 @@ def make_candidates(
     Depth takes part only where the model is in metres: without a scale its clouds do not fit the model's unit.
     """
     found, model, first_robust = _Candidates(inputs, start, steps), start, 0
-    found.add(ADJUSTED, start)
-    if not found.is_at_optimum:
-        found.add(POINTS, start, move_bodies=False, row=1)
+    poses = None
     if not found.costs[0].is_sound:
         poses = steps.step(resected_poses, start, None, title="resection").poses
-        # where the best is sound this only tells whether it is the optimum
-        found.add(RESECTED, start, poses, near_optimum=found.costs[found.best].is_sound)
-        if not found.costs[found.best].is_sound:
-            first_robust = len(found.candidates)
-            key, model = steps.key([start, ROBUST]), start.with_robust_loss()
-            steps.remember(model, key)
-            found.add(ROBUST_POINTS, model, move_bodies=False)
-            found.add(ROBUST, model, poses)
+        found.add(RESECTED, start, poses)
+    if not found.is_mended:
+        found.add(ADJUSTED, start, row=1)
+        if not found.is_at_optimum:
+            found.add(POINTS, start, move_bodies=False, row=1)
+    if poses is not None and not found.costs[found.best].is_sound:
+        first_robust = len(found.candidates)
+        key, model = steps.key([start, ROBUST]), start.with_robust_loss()
+        steps.remember(model, key)
+        found.add(ROBUST_POINTS, model, move_bodies=False)
+        found.add(ROBUST, model, poses)
     depth = depth_edges(model, options, steps, workers) if is_metric else no_depth_edges(model)
     solved = None
     if not found.is_settled or model.held_apart or depth.graph.edge_count:
@@ -260,20 +276,20 @@ def adjusted_model(
     poses: Floats | None,
     priors: PositionPriors | None,
     move_bodies: bool = True,
-    near_optimum: bool = False,
     *,
     step: Step,
 ) -> AdjustedModel:
     """Step: bundle adjustment from the model's own poses, or from these (B, 4, 4) with matched points merged.
 
     Adjustment brings more matched points together: these are merged after it, and adjusted once more. Without
-    `move_bodies` its points alone are adjusted, and none is merged. `near_optimum`: see `TrackedModel.adjusted`.
-    Raises `SourceError` where it fails.
+    `move_bodies` its points alone are adjusted, and none is merged. Poses that make the model sound are near its
+    optimum: see `TrackedModel.adjusted`. Raises `SourceError` where it fails.
     """
     if not move_bodies:
         return _written(start.moved(start.world_from_body).adjusted(move_bodies=False), step)
     model = start if poses is None else start.moved(poses).merged()
-    adjusted = model.adjusted(priors, near_optimum=near_optimum)
+    is_near = poses is not None and costs([start.quality], [model.quality])[1].is_sound
+    adjusted = model.adjusted(priors, near_optimum=is_near)
     if poses is not None:
         merged = adjusted.merged()
         adjusted = adjusted if merged is adjusted else merged.moved(merged.world_from_body).adjusted(priors)
