@@ -253,8 +253,10 @@ def test_poses_that_make_a_model_sound_are_near_its_optimum(
     monkeypatch.setattr(ColmapModel, "adjusted", adjusted)
     (model,) = ColmapModels().open_models(noisy(tmp_path))
     xi = off * np.random.default_rng(0).normal(size=(len(model.body_names), 6))
-    adjusted_model(model, model.world_from_body @ se3.exp(xi), None, step=Step(tmp_path, Mock(), Mock()))
-    assert told == [near]
+    for whole_steps in (True, False):
+        poses = model.world_from_body @ se3.exp(xi)
+        adjusted_model(model, poses, None, whole_steps=whole_steps, step=Step(tmp_path, Mock(), Mock()))
+    assert told == [near, False]
 
 
 def test_poses_that_tracks_hardly_fix_are_set_beside_those_of_the_input(

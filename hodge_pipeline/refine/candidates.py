@@ -139,6 +139,7 @@ class _Candidates:
         priors: PositionPriors | None = None,
         *,
         move_bodies: bool = True,
+        whole_steps: bool = False,
         row: int | None = None,
     ) -> None:
         """Adjust a model, as a step, from its own poses or from these (B, 4, 4), or its points alone; a failure is a
@@ -146,7 +147,7 @@ class _Candidates:
         """
         start = model, poses, priors or self._known
         try:
-            found = self._steps.step(adjusted_model, *start, move_bodies, title=name)
+            found = self._steps.step(adjusted_model, *start, move_bodies, whole_steps, title=name)
         except SourceError as error:
             self.notes.append(f"{name}: {error}")
             return
@@ -175,7 +176,7 @@ def make_candidates(
     poses = None
     if not found.costs[0].is_sound:
         poses = steps.step(resected_poses, start, None, title="resection").poses
-        found.add(RESECTED, start, poses)
+        found.add(RESECTED, start, poses, whole_steps=True)
     if not found.is_mended:
         found.add(ADJUSTED, start, row=1)
         if not found.is_at_optimum:
@@ -276,19 +277,21 @@ def adjusted_model(
     poses: Floats | None,
     priors: PositionPriors | None,
     move_bodies: bool = True,
+    whole_steps: bool = False,
     *,
     step: Step,
 ) -> AdjustedModel:
     """Step: bundle adjustment from the model's own poses, or from these (B, 4, 4) with matched points merged.
 
     Adjustment brings more matched points together: these are merged after it, and adjusted once more. Without
-    `move_bodies` its points alone are adjusted, and none is merged. Poses that make the model sound are near its
-    optimum: see `TrackedModel.adjusted`. Raises `SourceError` where it fails.
+    `move_bodies` its points alone are adjusted, and none is merged. With `whole_steps` poses that make the model sound
+    count as near its optimum, see `TrackedModel.adjusted`: not for a robust loss, which has many optima, nor after one,
+    where a few gross errors may pull far. Raises `SourceError` where it fails.
     """
     if not move_bodies:
         return _written(start.moved(start.world_from_body).adjusted(move_bodies=False), step)
     model = start if poses is None else start.moved(poses).merged()
-    is_near = poses is not None and costs([start.quality], [model.quality])[1].is_sound
+    is_near = whole_steps and costs([start.quality], [model.quality])[1].is_sound
     adjusted = model.adjusted(priors, near_optimum=is_near)
     if poses is not None:
         merged = adjusted.merged()
