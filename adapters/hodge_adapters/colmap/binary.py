@@ -15,6 +15,7 @@ import numpy as np
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import Points
 from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types.input_files import read_input
 
 _U64 = struct.Struct("<Q")
 _IMAGE = np.dtype([("image_id", "<u4"), ("pose", "<f8", 7), ("camera_id", "<u4")])
@@ -30,8 +31,8 @@ def content_arrays(reconstruction: pycolmap.Reconstruction) -> tuple[Mapping[int
     """
     with tempfile.TemporaryDirectory(prefix="hodge-colmap-") as scratch:
         reconstruction.write_binary(scratch)
-        seen = _observations((Path(scratch) / "images.bin").read_bytes())
-        points = _points((Path(scratch) / "points3D.bin").read_bytes())
+        seen = _observations(read_input(Path(scratch) / "images.bin"))
+        points = _points(read_input(Path(scratch) / "points3D.bin"))
     if (points.ids < 0).any():
         raise OverflowError("the id of a point is beyond 2^63")
     return seen, points
