@@ -235,6 +235,14 @@ def test_a_scan_of_the_ground_is_seen_from_its_scanner() -> None:
     assert not viewpoint(ground).any()
 
 
+def test_no_sensor_is_nearer_to_an_object_than_sensors_measure() -> None:
+    tile = np.append(np.random.default_rng(0).uniform(-0.05, 0.05, (500, 2)), np.full((500, 1), 0.08), axis=1)
+    assert (viewpoint(tile) == tile.mean(axis=0)).all()
+    assert not viewpoint(3 * tile).any(), "far enough away"
+    hull = np.concatenate([3 * tile, np.full((20, 3), 0.01)])
+    assert not viewpoint(hull).any(), "a few points, as of the scanner's own mount"
+
+
 def test_violation_is_the_worse_of_the_two_views() -> None:
     near, far = (
         depth_view(np.full((120, 160), 1.0, np.float32), CAMERA),
