@@ -10,6 +10,7 @@ import numpy as np
 
 from hodge_adapters.clouds.columns import ZERO, Columns, Corner, far_corner, points_of_parts
 from hodge_adapters.clouds.kitti import raised, read_bin
+from hodge_adapters.clouds.npy import npy_parts
 from hodge_adapters.clouds.pcd import exceeds_float32, pcd_parts
 from hodge_adapters.clouds.ply import ply_parts
 from hodge_adapters.clouds.scan_files import LIBRARIES, Scan, e57_parts, e57_scans, las_corner, las_parts
@@ -124,6 +125,7 @@ PARTS: Mapping[str, Callable[[Path], Iterator[Columns]]] = {
     ".asc": table_parts,
     ".csv": table_parts,
     ".vtk": vtk_parts,
+    ".npy": npy_parts,
 }
 WHOLE: Mapping[str, Callable[[Path], PointCloud]] = {".bin": read_bin, ".3d": read_uos}
 """Readers of files that are no columns of their own coordinates."""

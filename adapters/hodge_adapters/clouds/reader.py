@@ -15,6 +15,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters.clouds.fragments import ENDINGS, fragments_of, read_fragment
 from hodge_adapters.clouds.kitti import KITTI_RAISE_DEG, are_of_hdl64, ascends, is_scan, scan_poses
+from hodge_adapters.clouds.npy import holds_points
 from hodge_adapters.clouds.ply import write_ply
 from hodge_adapters.clouds.scan_files import LIBRARIES, library
 from hodge_adapters.clouds.tables import names_points
@@ -31,6 +32,8 @@ from hodge_pipeline.types.positions import whole_kilometres
 from hodge_pipeline.types.text import counted
 
 OTHER_SCANS = frozenset((".pts", ".ptx", ".obj", ".stl", ".off", ".ptc", ".fls", ".rcp"))
+TOLD_BY = {".csv": names_points, ".npy": holds_points}
+"""Files of these endings hold many things: the beginning of one tells whether it holds points."""
 _NUMBER = re.compile(r"(\d{1,19})\D*$")
 _CLOCK = re.compile(r"(?<!\d)(\d{9,10})([._])(\d{1,9})$")
 """Seconds since 1970 with a fraction, as bag_to_pcd names its files, or with nanoseconds of their own."""
@@ -207,9 +210,11 @@ def _near_zero(points: Floats) -> tuple[Floats32, list[str]]:
 
 
 def _is_scan(path: Path) -> bool:
-    """By its ending; `.bin` by its name as well, `.csv` by its first line."""
+    """By its ending; `.bin` by its name as well, `.csv` by its first line, `.npy` by its header."""
     ending = path.suffix.lower()
-    return ending in ENDINGS and (ending != ".bin" or is_scan(path.name)) and (ending != ".csv" or names_points(path))
+    if ending == ".bin":
+        return is_scan(path.name)
+    return ending in ENDINGS and (ending not in TOLD_BY or TOLD_BY[ending](path))
 
 
 def _listed(files: set[Path]) -> str:
