@@ -28,7 +28,7 @@ from hodge_pipeline.registration.scan_to_map import ScanToMap
 from hodge_pipeline.registration.sweeps import deskewed, deskewed_frame
 from hodge_pipeline.sources.frame_facts import frame_facts
 from hodge_pipeline.stages import Step, Steps, no_progress
-from hodge_pipeline.start.sweeps import Sweeps, deskewed_along, follow
+from hodge_pipeline.start.sweeps import Sweeps, deskewed_along, follow, key_rows
 from hodge_pipeline.types import Floats, Frame, Ints, PointCloud, Source
 from hodge_pipeline.types.notes import Note
 from hodge_pipeline.uses.trajectory import refine_trajectory
@@ -49,13 +49,17 @@ def street() -> list[Frame]:
 @pytest.fixture(scope="module", autouse=True)
 def first_velocity_once() -> Iterator[None]:
     """The first velocity of the same sweeps is found once: it is most of what following so few sweeps costs."""
-    found = dict[str, Floats]()
+    found = dict[str, tuple[Floats, frozenset[int]]]()
 
-    def first_velocity(voxel_m: float, sweeps: Sequence[tuple[float, PointCloud]]) -> Floats:
-        given = hashlib.sha256(pickle.dumps((voxel_m, [(at, one.points_in_cam, one.times_s) for at, one in sweeps])))
+    def first_velocity(
+        voxel_m: float, sweeps: Sequence[tuple[int, float, PointCloud]]
+    ) -> tuple[Floats, frozenset[int]]:
+        content = [(row, at, one.points_in_cam, one.times_s) for row, at, one in sweeps]
+        given = hashlib.sha256(pickle.dumps((voxel_m, content)))
         if given.hexdigest() not in found:
             found[given.hexdigest()] = scan_to_map.first_velocity(voxel_m, sweeps)
-        return found[given.hexdigest()].copy()
+        velocity, strange = found[given.hexdigest()]
+        return velocity.copy(), strange
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hodge_pipeline.start.sweeps.first_velocity", first_velocity)
@@ -300,7 +304,7 @@ def mirrored(cloud: PointCloud) -> PointCloud:
     return replace(cloud, points_in_cam=cloud.points_in_cam * np.array([-1, 1, 1], np.float32))
 
 
-@pytest.mark.parametrize("row", [12, COUNT - 1], ids=["in the middle", "the last"])
+@pytest.mark.parametrize("row", [0, 2, 12, COUNT - 1], ids=["the first", "the third", "in the middle", "the last"])
 def test_a_sweep_that_fits_nothing_around_it_is_left_out_and_named(row: int) -> None:
     frames = street().copy()
     frames[row] = changed(frames[row], mirrored)
@@ -309,6 +313,15 @@ def test_a_sweep_that_fits_nothing_around_it_is_left_out_and_named(row: int) -> 
     assert f"1 sweep is left out, and posed by neighbours where these are known; the first: {row}.pcd: it fits" in said
     rows = np.flatnonzero(found.found)
     assert absolute_error(found.world_from_scan[rows], true_poses(rows)).max_m < NEAR_M
+
+
+def test_key_frames_begin_and_end_with_sweeps_that_were_found() -> None:
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    poses[:, 0, 3] = 0.4 * np.arange(12)
+    at_hand = np.arange(12) % 7 > 0  # without the first and the seventh
+    at_hand[9:] = False
+    found = Sweeps(poses, np.zeros((12, 6)), at_hand, 40.0)
+    assert key_rows(found, (np.arange(9), np.arange(9, 12)), 1.0, 15.0).tolist() == [1, 4, 8]
 
 
 def test_a_scene_that_changes_is_followed() -> None:

@@ -180,23 +180,27 @@ def followed(tracker: ScanToMap, sweeps: Iterable[tuple[int, float, PointCloud]]
         yield held[0], None
 
 
-def first_velocity(voxel_m: float, sweeps: Sequence[tuple[float, PointCloud]]) -> Floats:
-    """The twist per second (6,) at the first of these sweeps, each with its time: tracked forwards and backwards until
-    it converges.
+def first_velocity(voxel_m: float, sweeps: Sequence[tuple[int, float, PointCloud]]) -> tuple[Floats, frozenset[int]]:
+    """The twist per second (6,) at the first of these sweeps, each with its row and time: tracked forwards and
+    backwards until it converges. The rows of strange ones among the first, which only the way back can tell.
 
     A first pass from rest gives too small a velocity, since rings on the ground look the same ahead. It has converged
     where one end of the sweeps has the velocity that it had before: each pass depends on the one that it begins with.
     """
     ends: list[Floats] = [np.zeros(6)]  # in turn at the first and at the last of the sweeps
+    early, strange = {row for row, _, _ in sweeps[: FEWEST_USUAL + 1]}, frozenset[int]()
     while len(sweeps) > 1 and len(ends) <= 2 * MOST_PASSES:
         tracker = ScanToMap(voxel_m, ends[-1], START_LEVELS, START_SAMPLE_M)
-        for time_s, cloud in sweeps if len(ends) % 2 else sweeps[::-1]:
-            tracker.follow(cloud, time_s)
+        if len(ends) % 2:
+            for _, time_s, cloud in (sweep for sweep in sweeps if sweep[0] not in strange):
+                tracker.follow(cloud, time_s)
+        else:
+            strange = frozenset(row for row, step in followed(tracker, sweeps[::-1]) if step is None and row in early)
         ends.append(tracker.velocity)
-        step_m = np.linalg.norm((ends[-1] - ends[max(0, len(ends) - 3)])[3:]) * (sweeps[1][0] - sweeps[0][0])
+        step_m = np.linalg.norm((ends[-1] - ends[max(0, len(ends) - 3)])[3:]) * (sweeps[1][1] - sweeps[0][1])
         if len(ends) > 2 and step_m < voxel_m / 2:
             break
-    return ends[(len(ends) - 1) // 2 * 2]
+    return ends[(len(ends) - 1) // 2 * 2], strange
 
 
 def _usual(shares: deque[float]) -> float:

@@ -46,7 +46,7 @@ SMALLEST_VOXEL_M = 0.08
 WARM_UP = 20
 """Sweeps that the first velocity is found on."""
 LEFT_OUT = "the sweep is left out"
-STRANGE = "it fits nothing around it, and the sweeps before and after it fit each other: is it of another place?"
+STRANGE = "it fits none of the sweeps around it, and these fit each other: is it of another place?"
 MOST_LOOSE = 0.5
 """Share of sweeps that tell little of how far the scanner went, above which the whole path is in doubt."""
 LOOKS = 9
@@ -94,8 +94,7 @@ class SweepsStart(OdometryStart):
         whole = replace(source, frames=frames)
         steps.remember(whole, steps.key([source, found]) + "deskewed")
         apart_m = found.reach_m / KEY_FRAMES_IN_REACH if self.distance_m is None else self.distance_m
-        rows = choose_key_frames(found.world_from_scan, sequences, apart_m, self.angle_deg, 0)
-        rows = rows[found.found[rows]]
+        rows = key_rows(found, sequences, apart_m, self.angle_deg)
         keys = key_source(whole, rows)
         steps.remember(keys, steps.key([whole, rows]))
         steps.note(Note("key frames", len(rows), str(len(frames))))
@@ -107,6 +106,12 @@ class SweepsStart(OdometryStart):
         )  # fmt: skip
         key_frames = _followers(whole, rows, found, joined, sequences)
         return replace(self.joined(whole, made, clouds, joined, key_frames, steps, workers), steps_stand=True)
+
+
+def key_rows(found: Sweeps, sequences: tuple[Ints, ...], apart_m: float, angle_deg: float) -> Ints:
+    """Rows of the key frames among the sweeps that were found: the first and the last of each sequence are some."""
+    read = [rows[found.found[rows]] for rows in sequences if found.found[rows].any()]
+    return choose_key_frames(found.world_from_scan, read, apart_m, angle_deg, 0)
 
 
 def follow(
@@ -161,15 +166,18 @@ def _follow_one(
     usual_m, usual_turn_s = _first_look(frames, clouds)
     times = _times(stamps_s, usual_turn_s)
     voxel = voxel_m or max(usual_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
-    first = zip(times, _sweeps(frames[:WARM_UP], clouds, usual_m), strict=False)
-    tracker = ScanToMap(voxel, first_velocity(voxel, [(at, one.cloud) for at, one in first if one.cloud]))
+    first = enumerate(_sweeps(frames[:WARM_UP], clouds, usual_m))
+    begun, strange = first_velocity(voxel, [(row, times[row], one.cloud) for row, one in first if one.cloud])
+    tracker = ScanToMap(voxel, begun)
 
     def read() -> Iterator[tuple[int, float, PointCloud]]:
         latest = 0
         for row, sweep in enumerate(_sweeps(frames, clouds, usual_m)):
             odd.extend([] if sweep.odd is None else [sweep.odd])
             original[row] = latest if sweep.is_copy else row
-            if sweep.cloud is not None:
+            if row in strange:
+                odd.append(Oddity(frames[row].frame_id, LEFT_OUT, STRANGE))
+            elif sweep.cloud is not None:
                 latest = row
                 middle_s[row] = first_after_s(sweep.cloud, frames[row].stamp_s)
                 yield row, times[row], sweep.cloud
