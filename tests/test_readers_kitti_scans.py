@@ -31,16 +31,32 @@ def columns_of_kitti(kind: str) -> np.ndarray:
             return np.column_stack([points, rng.integers(0, 256, len(points)), np.arange(len(points)) % 32]).astype(
                 "<f4"
             )
+        case "times":
+            return np.column_stack([points, rng.uniform(0, 255, len(points)), TIMES_S]).astype("<f4")
+        case "beams and times":
+            beams = np.arange(len(points)) % 32
+            return np.column_stack([points, rng.uniform(0, 255, len(points)), beams, TIMES_S]).astype("<f4")
+        case "something else":
+            along = points[np.argsort(np.arctan2(points[:, 1], points[:, 0]))]
+            return np.column_stack([along, rng.uniform(0, 255, (len(points), 2))]).astype("<f4")
     return np.column_stack([points + np.float32(20), rng.uniform(0, 255, len(points)).astype("<f4")])
 
 
-@pytest.mark.parametrize("kind", ["three", "three, no coordinate below 0", "share", "whole", "up to 255", "beams"])
+TIMES_S = np.linspace(0, 0.1, 48)
+KINDS = ["three", "three, no coordinate below 0", "share", "whole", "up to 255", "beams", "times", "beams and times"]
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "something else"])
 def test_columns_of_kittis_scans_are_told_apart(tmp_path: Path, kind: str) -> None:
     """48 points of three columns have the bytes of 36 of four, and 48 of four those of 64 of three."""
     table = columns_of_kitti(kind)
     (tmp_path / "000000.bin").write_bytes(table.tobytes())
     found = read_bin(tmp_path / "000000.bin")
     np.testing.assert_array_equal(found.points_in_cam, table[:, :3])
+    if "times" not in kind:
+        assert found.times_s is None
+    else:
+        np.testing.assert_allclose(found.times_s, TIMES_S, atol=1e-6)
 
 
 def test_scans_whose_names_end_in_a_number(tmp_path: Path) -> None:

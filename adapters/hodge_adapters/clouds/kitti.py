@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_adapters.clouds.columns import points_of_columns
+from hodge_adapters.clouds.columns import points_of_columns, seconds_after_first
 from hodge_adapters.text_rows import read_rows, reading, to_floats
 from hodge_adapters.trajectories.text import read_kitti
 from hodge_pipeline import se3
@@ -20,8 +20,14 @@ from hodge_pipeline.types.input_files import beginning, read_input
 POSES, CALIBRATION, TO_CAMERA = "poses.txt", "calib.txt", "Tr:"
 MAX_REFLECTANCE = 255
 MAX_BEAM = 255
-WIDTHS = (3, 4, 5)
-"""Columns: x, y, z; with a reflectance; with the number of the beam as well."""
+WIDTHS = (3, 4, 5, 6)
+"""Columns: x, y, z; with a reflectance; with the number of the beam, a time, or both in either order as well."""
+ASCENDING = 0.9
+"""Share of the points that are measured after the one before them: in files by beams all but one for each beam."""
+FOLLOWS = 0.5
+"""Points that follow each other along a scan are this much nearer than rows that are cut at a wrong width: of a cloud
+in no order the median steps of all widths are within a fifth of each other.
+"""
 KITTI_RAISE_DEG = 0.205
 """KITTI's calibration of its HDL-64E has the beams too low (Deschaud, IMLS-SLAM, ICRA 2018); KISS-ICP's value."""
 SCANS_LOOKED_AT = 9
@@ -44,7 +50,7 @@ def ascends(path: Path) -> bool:
 
 
 def read_bin(path: Path) -> PointCloud:
-    """The points of a scan of three to five columns (`WIDTHS`), told apart by what they then are.
+    """The points of a scan of three to six columns (`WIDTHS`), told apart by what they then are, with their times.
 
     Raises `SourceError` where it has none of these.
     """
@@ -52,28 +58,41 @@ def read_bin(path: Path) -> PointCloud:
         values = np.frombuffer(read_input(path), np.uint8)
     tables = {width: values.view("<f4").reshape(-1, width) for width in WIDTHS if len(values) % (4 * width) == 0}
     if not tables:
-        raise SourceError(f"{path}: {len(values)} bytes are no float32 rows of three to five columns: copy it again")
+        raise SourceError(f"{path}: {len(values)} bytes are no float32 rows of three to six columns: copy it again")
     table = _likeliest(tables)
-    found = points_of_columns(path, dict(zip("xyz", table.T[:3], strict=True)))
+    times = [column for column in table[:, 4:].T if _are_times(column, table[:, :3])]
+    found = points_of_columns(path, dict(zip((*"xyz", "time"), (*table.T[:3], *times), strict=False)))
     if len(table) and not len(found):
         raise SourceError(f"{path}: holds no finite coordinates: is it a scan of float32 x y z?")
     return found
 
 
 def _likeliest(tables: Mapping[int, Floats32]) -> Floats32:
-    """The table of most columns that mean what they should, else that of fewest."""
-    if 5 in tables and _has_reflectance(tables[5]) and _has_beams(tables[5]):
-        return tables[5]
-    if 4 in tables and _has_reflectance(tables[4]):
-        return tables[4]
-    return tables[min(tables)]
+    """The table of most columns that mean what they should, else that whose points follow each other, else that of
+    fewest columns.
+    """
+    for width in sorted(tables, reverse=True)[: len(tables) - (3 in tables)]:
+        table = tables[width]
+        if _has_reflectance(table) and all(_are_beams(last) or _are_times(last, table) for last in table[:, 4:].T):
+            return table
+    fewest = tables[min(tables)]
+    nearest = min(tables.values(), key=lambda table: _median_step(table[:, :3]))
+    follows = _median_step(nearest[:, :3]) < FOLLOWS * _median_step(fewest[:, :3])
+    return nearest if follows else fewest
 
 
-def _has_beams(table: Floats32) -> bool:
-    """Whether the last column is the number of a beam."""
+def _are_beams(column: Floats32) -> bool:
+    """Whether the values (N,) are numbers of beams."""
     with np.errstate(invalid="ignore"):
-        last = table[:, -1]
-        return bool(((last >= 0) & (last <= MAX_BEAM) & (last == np.round(last))).all())
+        return bool(((column >= 0) & (column <= MAX_BEAM) & (column == np.round(column))).all())
+
+
+def _are_times(column: Floats32, points: Floats32) -> bool:
+    """Whether the values (N,) are times of the points (N, 3 or more) in a revolution, which ascend as a rule."""
+    if _are_beams(column) or not (np.diff(column) >= 0).mean() > ASCENDING:
+        return False
+    returned = np.asarray(points[:, :3].any(axis=1))
+    return seconds_after_first(column.astype(float), returned)[0] is not None
 
 
 def _has_reflectance(table: Floats32) -> bool:
@@ -92,7 +111,10 @@ def _has_reflectance(table: Floats32) -> bool:
 
 
 def _median_step(points: Floats32) -> float:
-    return float(np.median(np.linalg.norm(np.diff(points.astype(float), axis=0), axis=1))) if len(points) > 1 else 0.0
+    if len(points) < 2:
+        return 0.0
+    steps = np.linalg.norm(np.diff(points.astype(float), axis=0), axis=1)
+    return float(np.median(np.nan_to_num(steps, nan=np.inf)))
 
 
 def raised(cloud: PointCloud, angle_deg: float) -> PointCloud:
