@@ -103,6 +103,13 @@ def test_what_is_no_recording(tmp_path: Path, files: dict[str, bytes], remedy: s
     assert str(tmp_path) in str(raised.value) and "\n" not in str(raised.value)
 
 
+def test_packets_of_a_scanner_name_what_to_record(tmp_path: Path) -> None:
+    log = Log()
+    log.add_bytes("/livox/lidar", "livox_ros_driver2/msg/CustomMsg", CDR, b"\0\1\0\0\5\0\0\0text\0")
+    with pytest.raises(SourceError, match=r"/livox/lidar \(livox_ros_driver2/msg/CustomMsg\): .* xfer_format 0"):
+        McapReader().open(log.write(tmp_path / "log.mcap"))
+
+
 def test_a_recording_of_other_things_names_its_topics(tmp_path: Path) -> None:
     log = Log()
     log.add_bytes("/chatter", "std_msgs/msg/String", CDR, b"\0\1\0\0\5\0\0\0text\0")
