@@ -53,7 +53,7 @@ def test_depth_on_colour_is_no_doubt(scale: float, right: float) -> None:
     assert doubts(scale, right) == ()
 
 
-@pytest.mark.parametrize(("scale", "right"), [(0.9, 0.0), (1.0, 14.0)])
+@pytest.mark.parametrize(("scale", "right"), [(0.9, 0.0), (1.57, 0.0), (1.0, 14.0)])
 def test_depth_beside_colour_is_told(scale: float, right: float) -> None:
     (note,) = doubts(scale, right)
     assert note.kind == "colour beside depth"

@@ -265,3 +265,64 @@ def test_the_camera_and_the_depth_scale_of_open3d_s_recordings(tmp_path: Path) -
     source = IclNuimReader().open(folder)
     assert source.frames[0].camera == Camera(8, 6, 10.0, 10.0, 3.5, 2.5) and source.frames[1].read_depth is not None
     np.testing.assert_allclose(source.frames[1].read_depth(), depth_values(1) / 4000, rtol=1e-6)
+
+
+def write_pairs(folder: Path, depth: str, colour: str, count: int = 3, ratio: int = 1) -> None:
+    """Images by these names; colour is `ratio` times as large as depth."""
+    for number in range(count):
+        write_depth(folder / depth.format(number), depth_values(number))
+        write_colour(folder / colour.format(number), size=(6 * ratio, 8 * ratio))
+
+
+def test_replica_has_both_kinds_in_one_folder_one_camera_above_and_true_poses(tmp_path: Path) -> None:
+    room, truth = tmp_path / "room0", some_poses(4)
+    write_pairs(room, "results/depth{:06d}.png", "results/frame{:06d}.jpg")
+    camera = {"w": 16, "h": 12, "fx": 20, "fy": 20, "cx": 7.5, "cy": 5.5, "scale": 6553.5}
+    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    (room / "traj.txt").write_text("\n".join(" ".join(map(str, pose.ravel())) for pose in truth))
+    source = check_reader(IclNuimReader(), room)
+    assert [frame.frame_id for frame in source.frames] == [0, 1, 2] and source.trajectory is not None
+    for row, frame in enumerate(source.frames):
+        assert frame.camera == Camera(8, 6, 10, 10, 3.5, 2.5) and frame.read_colour is not None
+        np.testing.assert_allclose(frame.read_depth(), depth_values(row) / 6553.5, rtol=1e-6)
+        np.testing.assert_allclose(frame.true_world_from_cam, truth[row], atol=1e-9)
+    assert IclNuimReader().sniff(room).confidence > 0.5
+    (room / "traj.txt").write_text("1 0 0")
+    with pytest.raises(SourceError, match=r"traj.txt: not sixteen numbers"):
+        IclNuimReader().open(room)
+
+
+def test_a_flat_folder_is_told_by_what_its_images_names_say(tmp_path: Path) -> None:
+    write_pairs(tmp_path, "depth_{:04d}.png", "rgb_{:04d}.png")
+    write_colour(tmp_path / "overview.png")
+    (tmp_path / "intrinsics.txt").write_text("10 10 3.5 2.5 8 6")
+    source = check_reader(IclNuimReader(), tmp_path)
+    assert len(source.frames) == 3 and all(frame.read_colour for frame in source.frames)
+    write_pairs(tmp_path / "photographs", "depth_{:04d}.png", "IMG_{:04d}.jpg")
+    assert IclNuimReader().sniff(tmp_path / "photographs").confidence == 0
+
+
+def test_stray_scanner_is_read_once_its_video_is_taken_apart(tmp_path: Path) -> None:
+    write_depth(tmp_path / "depth/000000.png", depth_values())
+    (tmp_path / "rgb.mp4").write_bytes(b"")
+    assert "ffmpeg -i rgb.mp4 -start_number 0 color/" in IclNuimReader().sniff(tmp_path).advice
+    write_pairs(tmp_path, "depth/{:06d}.png", "color/{:06d}.jpg", ratio=5)
+    (tmp_path / "camera_matrix.csv").write_text("50.0, 0.0, 19.5\n0.0, 50.0, 14.5\n0.0, 0.0, 1.0\n")
+    pose = some_poses(1)[0]
+    (tmp_path / "odometry.csv").write_text(
+        "timestamp, frame, x, y, z, qx, qy, qz, qw\n"
+        + ", ".join(["1.5", "000001", *map(str, [*pose[:3, 3], *se3.to_quat_xyzw(pose)])])
+    )
+    source = check_reader(IclNuimReader(), tmp_path)
+    assert source.frames[0].camera == Camera(8, 6, 10, 10, 3.5, 2.5), "the matrix is of colour, five times as large"
+    assert source.frames[0].world_from_cam is None and source.trajectory is None
+    np.testing.assert_allclose(source.frames[1].world_from_cam, pose, atol=1e-9)
+    assert source.frames[1].true_world_from_cam is None
+
+
+@pytest.mark.parametrize("name", ["scan.r3d", "scan"])
+def test_record3d_is_named(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    (path / "rgbd").mkdir(parents=True)
+    (path / "metadata").write_text("{}")
+    assert "Record3D" in IclNuimReader().sniff(path).advice

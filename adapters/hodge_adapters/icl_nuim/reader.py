@@ -1,52 +1,54 @@
-"""ICL-NUIM in its three layouts: TUM-like PNG folders, POV-Ray files, and Redwood's re-renderings of its rooms.
+"""ICL-NUIM in its three layouts: TUM-like PNG folders, POV-Ray files, and Redwood's re-renderings of its rooms, whose
+layout Replica, ScanNet and Stray Scanner nearly have.
 
 The first two have y pointing up, so fy = −480; the world is the files' own.
 """
 
 from __future__ import annotations
 
-import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.association import unpaired_doubts
+from hodge_adapters.icl_nuim.numbered import (
+    LAYOUT,
+    REPLICA_IMAGES,
+    estimated_poses,
+    find_images,
+    list_images,
+    phone_advice,
+    true_poses,
+)
 from hodge_adapters.icl_nuim.pov import list_pov, pov_frames
+from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
 from hodge_adapters.images.fitted_camera import UNSTAMPED_STEP_S, assumed_camera_doubts
 from hodge_adapters.posed import posed_frames
-from hodge_adapters.seven_scenes.files import FrameFiles, read_poses
-from hodge_adapters.text_rows import first_text, listed, names_in
-from hodge_adapters.trajectories.log import read_log_file
+from hodge_adapters.text_rows import first_text
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_adapters.tum.image_lists import (
     StampedImages,
     find_association_file,
-    find_colour_folder,
     read_pairs,
-    stamped_images,
 )
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Floats, Frame, Source
-from hodge_pipeline.types.text import counted
 
 ICL = Intrinsics(481.2, -480.0, 319.5, 239.5, (640, 480))
 REDWOOD = Intrinsics(525.0, 525.0, 319.5, 239.5, (640, 480))
+REPLICA = Intrinsics(600.0, 600.0, 599.5, 339.5, (1200, 680), 6553.5)
+"""As NICE-SLAM's `cam_params.json` has it."""
 ICL_UNITS_PER_METRE, REDWOOD_UNITS_PER_METRE = 5000.0, 1000.0
-LAYOUT = "put depth (PNG of 16 bits) in depth/ and colour in color/, both named by one number, 00000.png, …"
 TRUTH_PATTERN = "*.gt.freiburg*"
 MAX_GAP_FRAMES = 1.0
 VIDEO_HZ = 30.0
 """Frames are rendered at this rate along a walked path."""
 SNIFFED_BYTES = 1 << 16
-LOG_FILES = ("trajectory.log", "scene/trajectory.log", "test_scene/trajectory.log")
-TUM_FILES = ("depth.txt", "rgb.txt", "groundtruth.txt")
-_NUMBER = re.compile(r"(?<!\d)\d{1,18}(?!\d)")
-_IMAGES = (".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -73,21 +75,27 @@ class IclNuimReader:
         try:
             if path.is_file():
                 truth_alone = ".gt.freiburg" in path.name
-                return Sniff(0.9, "a .gt.freiburg file") if truth_alone else Sniff(0.0, "not a folder")
+                alone = Sniff(0.9, "a .gt.freiburg file")
+                return alone if truth_alone else Sniff(0.0, "not a folder", phone_advice(path))
             if _find_truth(path) and (find_association_file(path) or (path / "depth.txt").is_file()):
                 return Sniff(0.95, "a .gt.freiburg file beside image lists")
-            if _find_truth(path) and is_redwood(path):
+            if _find_truth(path) and find_images(path):
                 return Sniff(0.9, "a .gt.freiburg file beside depth/ and rgb/")
             if list_pov(path):
                 return Sniff(0.95, "scene_00_0000.depth files")
-            if is_redwood(path):
-                return Sniff(0.7, "depth/ and image/ or color/ without lists of stamps")
+            if images := find_images(path):
+                apart = images[0] != images[1]
+                told = (
+                    "depth/ and image/ or color/ without lists of stamps" if apart else "depth and colour in one folder"
+                )
+                return Sniff(0.7 if apart else 0.6, told)
             association = find_association_file(path)
             if association and _is_numbered(association):
                 return Sniff(0.5, f"{association.name} with frame numbers for stamps")
         except (OSError, SourceError):
             return Sniff(0.0, "not a folder that can be read")
-        return Sniff(0.0, "no .gt.freiburg, no scene_00_0000.depth, no depth/ beside image/ or color/")
+        why = "no .gt.freiburg, no scene_00_0000.depth, no depth/ beside image/ or color/"
+        return Sniff(0.0, why, phone_advice(path))
 
     def open(self, path: Path) -> Source:
         """Frames with the number in the file name (or the list's stamp) as id and stamp, and the truth as trajectory.
@@ -106,7 +114,7 @@ class IclNuimReader:
             return self._open_pov(path, pov)
         if find_association_file(path) or (path / "depth.txt").is_file():
             return self._open_lists(path)
-        if is_redwood(path):
+        if find_images(path):
             return self._open_unlisted(path) if _find_truth(path) else self._open_redwood(path)
         raise SourceError(
             f"{path}: no associations.txt, no scene_00_0000.depth, no depth/ beside image/ or color/ in it: {LAYOUT}"
@@ -158,7 +166,10 @@ class IclNuimReader:
         *,
         is_true: bool,
     ) -> tuple[Frame, ...]:
-        camera = self._camera(default).camera_of(listing.depth, notes)
+        found = self._camera(default)
+        if found.size is None:
+            found = _sized(found, listing)
+        camera = found.camera_of(listing.depth, notes)
         scale = self.depth_scale or default.units_per_metre or units_per_metre
         return listing.frames(camera, poses, self.every, notes, units_per_metre=scale, is_true=is_true)
 
@@ -182,42 +193,47 @@ class IclNuimReader:
     def _open_redwood(self, path: Path) -> Source:
         notes: list[str] = []
         listing = list_images(path, notes)
-        poses, log = _estimated(path, listing.ids, notes)
-        own = None if self.camera else find_camera_file(path)
+        true = true_poses(path, listing.ids, notes)
+        poses, file = true or estimated_poses(path, listing.ids, notes)
+        known, name = (REPLICA, "Replica") if (path / REPLICA_IMAGES).is_dir() else (REDWOOD, "Redwood")
+        own = None if self.camera else self._camera_file(path)
         if own:
-            notes.append(f"intrinsics from {own.relative_to(path)}")
+            notes.append(f"intrinsics from {own.name if own.parent != path else own.relative_to(path)}")
         doubts = listing.doubts
+        units_per_metre = known.units_per_metre or REDWOOD_UNITS_PER_METRE
         if own is None and not self.camera:
-            stamps_s, scale = UNSTAMPED_STEP_S * listing.stamps_s, self.depth_scale or REDWOOD_UNITS_PER_METRE
-            doubts += assumed_camera_doubts(REDWOOD, listing.depth, listing.colour, stamps_s, scale)
-            notes.append(
-                "Redwood's intrinsics taken (525 525 319.5 239.5), since there is no camera file in the folder"
-            )
-        default = read_intrinsics(own) if own else REDWOOD
-        frames = self._frames(listing, default, poses, REDWOOD_UNITS_PER_METRE, notes, is_true=False)
-        files = (*filter(None, [log, own]), *listing.depth, *filter(None, listing.colour))
+            stamps_s, scale = UNSTAMPED_STEP_S * listing.stamps_s, self.depth_scale or units_per_metre
+            doubts += assumed_camera_doubts(known, listing.depth, listing.colour, stamps_s, scale)
+            pinhole = f"{known.fx:g} {known.fy:g} {known.cx:g} {known.cy:g}"
+            notes.append(f"{name}'s intrinsics taken ({pinhole}), since there is no camera file in the folder")
+        default = read_intrinsics(own) if own else known
+        frames = self._frames(listing, default, poses, units_per_metre, notes, is_true=true is not None)
+        files = (*filter(None, [file, own]), *listing.depth, *filter(None, listing.colour))
         return Source(
-            path.resolve().name, path, frames, notes=tuple(notes), files=files, doubts=doubts, numbered_hz=VIDEO_HZ
+            path.resolve().name,
+            path,
+            frames,
+            posed_frames(frames) if true else None,
+            notes=tuple(notes),
+            files=files,
+            doubts=doubts,
+            numbered_hz=VIDEO_HZ,
         )
 
+    @staticmethod
+    def _camera_file(path: Path) -> Path | None:
+        """That of the folder; Replica has one for all its rooms."""
+        above = path.resolve().parent if (path / REPLICA_IMAGES).is_dir() else path
+        return find_camera_file(path) or find_camera_file(above)
 
-def _estimated(path: Path, numbers: list[int], notes: list[str]) -> tuple[Floats, Path | None]:
-    """Poses (N, 4, 4) of these frames by `trajectory.log`, or by ScanNet's `pose/0.txt`, …, NaN where there is
-    none; and the path of the log, if there is one.
+
+def _sized(found: Intrinsics, listing: StampedImages) -> Intrinsics:
+    """The intrinsics with the size of depth or of colour: that whose middle lies nearer to the principal point, since
+    phones state those of colour, seven times as large as depth.
     """
-    log, folder = find_log(path), path / "pose"
-    if log is None and not folder.is_dir():
-        return np.full((len(numbers), 4, 4), np.nan), None
-    notes.append(f"poses from {(log or folder).relative_to(path)}: an estimate of another program, not the truth")
-    if log is None:
-        files = [FrameFiles(folder.name, number, 0, {"pose": folder / f"{number}.txt"}) for number in numbers]
-        return read_poses(files, notes), None
-    estimates = read_log_file(log).poses
-    poses = np.array([estimates.get(number, np.full((4, 4), np.nan)) for number in numbers])
-    without = int(np.isnan(poses[:, 0, 0]).sum())
-    if without:
-        notes.append(f"{without} of {len(poses)} frames have no pose in it")
-    return poses, log
+    colour = [path for path in listing.colour if path]
+    sizes = [pixels.common_size(images) for images in (listing.depth, colour) if images]
+    return replace(found, size=min(sizes, key=lambda size: abs(np.log(2 * found.cx / size[0])) if found.cx > 0 else 0))
 
 
 def _find_truth(folder: Path) -> Path | None:
@@ -229,64 +245,3 @@ def _is_numbered(association: Path) -> bool:
     lines = first_text(association, SNIFFED_BYTES).splitlines()
     row = next((line.split() for line in lines if line.strip() and not line.startswith("#")), [""])
     return row[0].isdigit()
-
-
-def is_redwood(folder: Path) -> bool:
-    """Whether the folder has a depth and a colour folder, and no list or truth of a TUM sequence."""
-    if any((folder / name).is_file() for name in TUM_FILES):
-        return False
-    return find_colour_folder(folder) is not None and (folder / "depth").is_dir()
-
-
-def list_images(folder: Path, notes: list[str]) -> StampedImages:
-    """The images of a folder by the number in their names, their stamp; depth without colour is noted."""
-    if stamped_images(folder / "depth"):
-        raise SourceError(
-            f"{folder / 'depth'}: its images are named by their stamps: read them with the reader tum (hodge run tum), "
-            "and set source.reader.depth_scale=1000 if depth is in millimetres"
-        )
-    depth = _by_number(folder / "depth", notes)
-    if not depth:
-        raise SourceError(f"{folder / 'depth'}: no PNG in it: {LAYOUT}")
-    colour_folder = find_colour_folder(folder)
-    colour = _by_number(colour_folder, notes) if colour_folder else {}
-    numbers = sorted(depth)
-    alone = [number for number in numbers if number not in colour]
-    if alone:
-        notes.append(f"{counted(len(alone), 'frame has|frames have')} no colour image: {listed(alone)}")
-    doubts = unpaired_doubts([number in colour for number in numbers]) if colour else ()
-    none_s, one_run = np.zeros(len(numbers)), np.zeros(len(numbers), np.int64)
-    stamps_s = np.array(numbers, float)
-    images = [depth[number] for number in numbers], [colour.get(number) for number in numbers]
-    return StampedImages(stamps_s, *images, none_s, (), one_run, doubts)
-
-
-def find_log(folder: Path) -> Path | None:
-    """The trajectory of a folder, by its usual places."""
-    return next((folder / name for name in LOG_FILES if (folder / name).is_file()), None)
-
-
-def _by_number(folder: Path, notes: list[str]) -> dict[int, Path]:
-    """The images of a folder by the first of the numbers in their names that tells most of them apart, so that
-    `d435_0001.png` is 1. Raises `SourceError` where most have none of their own.
-    """
-    names = [name for name in names_in(folder) if name.lower().endswith(_IMAGES)]
-    numbers = [[int(digits) for digits in _NUMBER.findall(Path(name).stem)] for name in names]
-    places = range(max(map(len, numbers), default=0))
-    place = max(places, key=lambda place: len({each[place] for each in numbers if place < len(each)}), default=0)
-    found: dict[int, Path] = {}
-    skipped: list[str] = []
-    for name, each in zip(names, numbers, strict=True):
-        if place >= len(each) or each[place] in found:
-            skipped.append(name)
-        else:
-            found[each[place]] = folder / name
-    if len(skipped) > len(found):
-        raise SourceError(
-            f"{folder}: {len(skipped)} of {len(names)} images have no number of their own ({listed(skipped)}), by "
-            f"which depth and colour are paired: {LAYOUT}"
-        )
-    if skipped:
-        left_out = counted(len(skipped), "image")
-        notes.append(f"{folder.name}: {left_out} without an own number left out: {listed(skipped)}")
-    return found

@@ -31,6 +31,8 @@ CAMERA_FILES = (
     "camera_intrinsics.json",
     "intrinsic.json",
     "intrinsic/intrinsic_depth.txt",
+    "cam_params.json",
+    "camera_matrix.csv",
     "K.txt",
     "info.txt",
     "TUM1.yaml",
@@ -38,7 +40,7 @@ CAMERA_FILES = (
     "TUM3.yaml",
 )
 """Usual names, also of Open3D, whose recordings of a RealSense or an Azure Kinect have `intrinsic.json`, ScanNet's
-exporter, deep-video-mvs, BundleFusion and ORB-SLAM."""
+exporter, Replica as NICE-SLAM renders it, Stray Scanner, deep-video-mvs, BundleFusion and ORB-SLAM."""
 LONGEST_READOUT_S = 1.0
 """Upper bound on a rolling shutter's read-out time: slower cameras give no video."""
 _SUPPORTED = "`fx fy cx cy [width height]` on one line, a 3x3 matrix, `fx: …` lines, or Open3D's JSON"
@@ -204,8 +206,13 @@ def _distortion(values: dict[str, float]) -> tuple[float, float, float, float, f
 
 
 def _from_json(path: Path) -> Intrinsics:
-    """Open3D's `camera_intrinsic.json`: the matrix is stored by columns; its recordings have a `depth_scale` too."""
+    """Open3D's `camera_intrinsic.json`: the matrix is stored by columns; its recordings have a `depth_scale` too. Or
+    NICE-SLAM's `cam_params.json`, whose `camera` has fx, fy, cx, cy, w, h and scale.
+    """
     content = read_json(path)
+    if isinstance(camera := content.get("camera"), dict):
+        fx, fy, cx, cy = (number(camera.get(name)) or math.nan for name in ("fx", "fy", "cx", "cy"))
+        return Intrinsics(fx, fy, cx, cy, _size(camera.get("w"), camera.get("h")), number(camera.get("scale")))
     matrix = numbers(content.get("intrinsic_matrix"), 9, f"{path}: intrinsic_matrix").tolist()
     size = _size(content.get("width"), content.get("height"))
     return Intrinsics(matrix[0], matrix[4], matrix[6], matrix[7], size, number(content.get("depth_scale")))
