@@ -22,6 +22,8 @@ START = "start"
 """The name of given poses, and of first poses that are not odometry's."""
 FIRST = "first poses"
 """Their name where they are not the given ones."""
+SHORTEST_STEP_S = 1e-3
+"""Depth cameras take 300 frames a second at most (RealSense D435)."""
 UNIX_STAMP_S = 1e8
 """Stamps above this (1973) are seconds since 1970, smaller ones count from a start of their own."""
 
@@ -218,20 +220,29 @@ def vertex_ids(source: Source) -> NDArray[np.generic]:
 def stamps_of(source: Source) -> Floats:
     """Times (N,) of the frames, ascending in each sequence: where its clock goes back, by a step as long as the others.
 
-    In a sequence whose stamps are no clock's, or mostly do not ascend, the times are the numbers of the frames.
+    In a sequence whose stamps are no clock's, or no camera's, or mostly do not ascend, the times are the numbers of the
+    frames.
     """
     stamps = np.array([frame.stamp_s for frame in source.frames], float)
     for rows in sequences_of(source).values():
         steps_s = np.diff(stamps[rows])
         ahead = steps_s > 0
-        if ahead.all():
+        is_sound = not faster_than_cameras(stamps[rows])
+        if ahead.all() and is_sound:
             continue
-        if is_clock(stamps[rows]) and 2 * ahead.sum() > len(steps_s):
+        if is_clock(stamps[rows]) and 2 * ahead.sum() > len(steps_s) and is_sound:
             steps_s = np.where(ahead, steps_s, np.median(steps_s[ahead]))
             stamps[rows[1:]] = stamps[rows[0]] + np.cumsum(steps_s)
         else:
             stamps[rows] = np.arange(len(rows))
     return stamps
+
+
+def faster_than_cameras(stamps_s: Floats) -> bool:
+    """Whether stamps (N,) of a clock follow each other faster than any camera's images: made up, or of another unit."""
+    steps_s = np.diff(stamps_s)
+    ahead = steps_s[steps_s > 0]
+    return is_clock(stamps_s) and len(ahead) > 0 and float(np.median(ahead)) < SHORTEST_STEP_S
 
 
 def has_real_stamps(frames: Sequence[Frame]) -> bool:

@@ -19,7 +19,9 @@ def test_only_the_step_over_which_a_clock_goes_back_is_made_up(begin_s: float) -
     np.testing.assert_allclose(tracked.stamps_of(source) - begin_s, [0.25, 0.5, 1.0, 1.25, 1.5, 2.0, 2.25])
 
 
-@pytest.mark.parametrize("stamps", [[0.5] * 5, [1.5, 1.5, 1.5, 2.5, 2.5], [3.0, 4.0, 1.0, 2.0, 3.0]])
+@pytest.mark.parametrize(
+    "stamps", [[0.5] * 5, [1.5, 1.5, 1.5, 2.5, 2.5], [3.0, 4.0, 1.0, 2.0, 3.0], [0.5, 0.5001, 0.5002, 0.6, 0.6001]]
+)
 def test_stamps_that_are_no_clock_are_the_numbers_of_the_frames(stamps: list[float]) -> None:
     source = Source("s", Path("s"), tuple(Frame(row, stamp) for row, stamp in enumerate(stamps)))
     np.testing.assert_array_equal(tracked.stamps_of(source), np.arange(5))

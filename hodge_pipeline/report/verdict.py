@@ -58,6 +58,7 @@ REASONS = {
     "frames outside": "most frames lie outside the time of the poses given",
     "depth unit": "depth is probably not in metres",
     "colour beside depth": "depth seems not to be registered to colour",
+    "colour of another moment": "colour seems to be of another moment than depth",
     "focal length": "images contradict the camera's focal length",
     "millimetres": "its unit looks like the millimetre",
     "left apart": "a guess joins what tracking left apart",

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from hodge_pipeline.errors import SourceError
+from hodge_pipeline.sources.colour_moment import late_doubts
 from hodge_pipeline.sources.depth_units import SAMPLED_FRAMES, doubts_of
 from hodge_pipeline.types import Bytes, Floats, Floats32, Frame, Source
 from hodge_pipeline.types.arrays import evenly
@@ -58,14 +59,16 @@ def image_doubts(frames: Sequence[Frame]) -> tuple[Note, ...]:
         except (SourceError, OSError):
             continue
     units = doubts_of(np.concatenate([depth_m.ravel() for depth_m in values])) if values else ()
-    return (*units, *colour_doubts(found))
+    return (*units, *(colour_doubts(found) or late_doubts(with_depth)))
 
 
 def usable_colour(source: Source, doubts: Sequence[Note]) -> Source:
-    """The source, its frames without colour where that is doubted to lie on depth: landmarks then have the depth of
-    other things, and place frames worse than surfaces alone. The images are still shown as they are stored.
+    """The source, its frames without colour where that is doubted to lie on depth, or to be of its moment.
+
+    Landmarks then have the depth of other things, and place frames worse than surfaces alone. The images are still
+    shown as they are stored.
     """
-    if not any(doubt.kind == "colour beside depth" for doubt in doubts):
+    if not any(doubt.kind in ("colour beside depth", "colour of another moment") for doubt in doubts):
         return source
     return replace(source, frames=[replace(frame, read_colour=None) for frame in source.frames])
 

@@ -28,7 +28,9 @@ from hodge_pipeline.registration.tracking import FrameBlock, TrackingOptions, fr
 from hodge_pipeline.scene import (
     KeyFrames,
     Scene,
+    faster_than_cameras,
     has_real_stamps,
+    is_clock,
     sequence_numbers,
     sequences_of,
     stamps_of,
@@ -285,7 +287,12 @@ def _notes(source: Source, tracked: Tracked, parts: list[BlockRows], repeats: In
         return np.unique(np.concatenate([getattr(part, column) for part in parts]))
 
     notes = [Note("key frames", len(tracked.key_rows), str(len(tracked.anchors)))]
+    own = [np.array([source.frames[row].stamp_s for row in rows]) for rows in sequences]
     back = [row for rows in sequences for row in _where_the_clock_goes_back(source, rows)]
+    too_fast = [stamps for stamps in own if faster_than_cameras(stamps)]
+    if too_fast:
+        usual_s = float(np.median(np.concatenate([abs(np.diff(stamps)) for stamps in too_fast])))
+        notes.append(Note("no clock", len(too_fast), f"{1000 * usual_s:.2g}"))
     notes += listed("clock", np.array(back, np.int64))
     notes += told_gaps(sequences, stamps_of(source), ids)
     notes += listed("repeated images", repeats)
@@ -310,9 +317,9 @@ def _notes(source: Source, tracked: Tracked, parts: list[BlockRows], repeats: In
 
 def _where_the_clock_goes_back(source: Source, rows: Ints) -> list[int]:
     """The rows of a sequence whose real stamp is no later than the one before."""
-    if not has_real_stamps([source.frames[row] for row in rows]):
-        return []
     stamps = np.array([source.frames[row].stamp_s for row in rows])
+    if not is_clock(stamps) or faster_than_cameras(stamps):
+        return []
     return [int(row) for row in rows[1:][np.diff(stamps) <= 0]]
 
 

@@ -32,6 +32,8 @@ INPUTS = {
     "colour beside depth": "Depth seems not to be registered to colour: edges of both agree better with depth "
     "{detail}. Surfaces alone place frames. Record depth registered (aligned) to colour, or give the images of one "
     "camera and one moment.",
+    "colour of another moment": "Colour seems to be of another moment than depth: that of {detail} lies on it better. "
+    "Surfaces alone place frames. Mend the stamps or the pairs of images.",
     "focal length": "The camera's intrinsics are probably wrong: what frames saw of each other fits a focal length of "
     "{detail} (source.reader.camera, or the file it is read from).",
     "millimetres": "{detail}",
@@ -94,6 +96,7 @@ LOOKS = {
     "one even colour ({detail}): surfaces alone place them",
     "moving objects": "much of {count} {count:frame|frames} moved otherwise than the camera ({detail}): people or "
     "objects that move? The camera's motion is the one that fits more of the image; key frames leave out what moves",
+    "no clock": "stamps follow each other in {detail} ms, as no camera's images do: frames are taken as evenly spaced",
     "clock": "the clock goes back at {detail}: the step there counts as long as the usual one",
     "holes": "the recording stops for {detail}: what the frames on both sides share tells the motion there",
     "path broken": "tracking was lost for good in {count} {count:place|places}: the path is in {detail} pieces",
