@@ -300,6 +300,9 @@ def test_a_flat_folder_is_told_by_what_its_images_names_say(tmp_path: Path) -> N
     assert len(source.frames) == 3 and all(frame.read_colour for frame in source.frames)
     write_pairs(tmp_path / "photographs", "depth_{:04d}.png", "IMG_{:04d}.jpg")
     assert IclNuimReader().sniff(tmp_path / "photographs").confidence == 0
+    for number in range(6):
+        write_colour(tmp_path / f"photographs/image_{number}.jpg")
+    assert IclNuimReader().sniff(tmp_path / "photographs").confidence == 0, "few of them are of depth"
 
 
 def test_stray_scanner_is_read_once_its_video_is_taken_apart(tmp_path: Path) -> None:
@@ -311,7 +314,7 @@ def test_stray_scanner_is_read_once_its_video_is_taken_apart(tmp_path: Path) -> 
     pose = some_poses(1)[0]
     (tmp_path / "odometry.csv").write_text(
         "timestamp, frame, x, y, z, qx, qy, qz, qw\n"
-        + ", ".join(["1.5", "000001", *map(str, [*pose[:3, 3], *se3.to_quat_xyzw(pose)])])
+        + ", ".join(["7.5", "000001", *map(str, [*pose[:3, 3], *se3.to_quat_xyzw(pose)])])
     )
     source = check_reader(IclNuimReader(), tmp_path)
     assert source.frames[0].camera == Camera(8, 6, 10, 10, 3.5, 2.5), "the matrix is of colour, five times as large"
