@@ -8,8 +8,8 @@ Each model is taken for good and disturbed: `noise`: 0.5° and 2 % of the scene 
 `carried`: so, and every point moved with its images; `wrong`: 15 % of the images 15° and 25 % off; `halves`: two
 overlapping models, each in a gauge and unit of its own; `renamed`, `no_images`, `no_database`: noise, and images under
 other names than the database's, or without images or database. The peer is pycolmap's bundle adjustment with cameras
-held. Centres are root mean squares after a similarity,
-in % of the extent of the good model's cameras; CPU seconds are those of whole processes.
+held. Centres are root mean squares after a similarity, in % of the extent of the cameras, against the good model or, if
+it has a folder `true`, the one there; CPU seconds are those of whole processes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pycolmap
-from synthetic_colmap import make
+from synthetic_colmap import TRUE, make
 
 from hodge_pipeline import se3
 
@@ -92,7 +92,8 @@ def measured(good: Path, kind: str, seed: int, work: Path) -> Row:
     seconds, text = cpu_of([*command, *beside(good, kind)])
     ours = sorted((out / "sparse").glob("*"))
     peers = [peer for peer in peers if any(peer.iterdir())]  # pycolmap refuses some models
-    sets = [[compared(good, model, kind) for model in models] for models in (starts, peers, ours)]
+    true = good / TRUE if (good / TRUE).is_dir() else good
+    sets = [[compared(true, model, kind) for model in models] for models in (starts, peers, ours)]
     percent = [max((one[0] for one in found), default=float("inf")) for found in sets]
     px = [max((one[1] for one in found), default=float("inf")) for found in sets]
     report = json.loads(text) if text.startswith("{") else {}

@@ -210,11 +210,11 @@ def test_a_reconstruction_goes_in_and_comes_out_and_nothing_is_computed_twice(
 ) -> None:
     model = noisy(tmp_path)
     start = pycolmap.Reconstruction(disturbed(model, tmp_path / "start"))
-    counts = {name: Mock(wraps=getattr(tracked, name)) for name in ("content_of", "standard_errors")}
+    counts = {name: Mock(wraps=getattr(tracked, name)) for name in ("content_of", "information")}
     for name, counted in counts.items():
         monkeypatch.setattr(tracked, name, counted)
     (refined,) = hodge_pipeline.refine_colmap(start, database="none", overrides=FREE).models
-    assert {name: counted.call_count for name, counted in counts.items()} == {"content_of": 0, "standard_errors": 1}
+    assert {name: counted.call_count for name, counted in counts.items()} == {"content_of": 0, "information": 1}
     refined.update_point_3d_errors()
     assert refined.compute_mean_reprojection_error() <= 1.001 * error_px(model)
 

@@ -14,7 +14,7 @@ import hodge_pipeline
 from colmap_data import FREE, noisy
 from hodge_adapters.colmap import uncertainty
 from hodge_adapters.colmap.models import ColmapModels
-from hodge_adapters.colmap.uncertainty import standard_errors
+from hodge_adapters.colmap.uncertainty import information
 from hodge_pipeline import se3
 from hodge_pipeline.refine.reprojection_cost import best, costs, mends, spoilt_doubt
 from hodge_pipeline.types import ModelQuality
@@ -156,7 +156,7 @@ def test_one_point_near_the_plane_of_a_camera_does_not_make_every_pose_uncertain
     in_cam = cam_from_world * point.xyz
     point.xyz = cam_from_world.inverse() * np.array([in_cam[0], in_cam[1], 1e-2])
     sure, unsure = (
-        np.sqrt((standard_errors(model.records, model.bodies) ** 2).mean(axis=0))
+        np.sqrt((information(model.records, model.bodies).standard_errors ** 2).mean(axis=0))
         for model in (ColmapModels(database="none", images="none").open_models([one])[0] for one in (right, wrong))
     )
     np.testing.assert_allclose(unsure, sure, rtol=0.05)
@@ -171,7 +171,7 @@ def test_a_body_that_sees_nothing_does_not_make_the_others_uncertain(tmp_path: P
             if seen.has_point3D():
                 blind.delete_observation(data.id, column)
     models = [ColmapModels(database="none", images="none").open_models([one])[0] for one in (full, blind)]
-    sure, unsure = (standard_errors(model.records, model.bodies) for model in models)
+    sure, unsure = (information(model.records, model.bodies).standard_errors for model in models)
     unseen = np.array(models[1].bodies.frame_ids) == frame_id
     assert np.isnan(unsure[unseen]).all()
     assert (unsure[~unseen] < 1.5 * sure[~unseen]).all()

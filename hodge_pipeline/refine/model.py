@@ -246,7 +246,7 @@ def _change(start: TrackedModel, scale: Scale, model: TrackedModel, in_world: bo
     """How far the bodies moved from the input's poses, aligned to them, and the uncertainty that the tracks leave."""
     before, after = start.world_from_body, model.world_from_body
     moved = moves(before, after)
-    errors = model.standard_errors()
+    errors = model.information.standard_errors
     known = errors[np.isfinite(errors).all(axis=1)]
     rotation, position = np.sqrt((known**2).mean(axis=0)) if len(known) else (np.nan, np.nan)
     if scale.is_observable:  # an error of the scale moves a body by as much as it is from the middle

@@ -19,6 +19,7 @@ MOST_SAMPLED = 60
 """Poses whose covariance is computed: enough for a root mean square."""
 SIGMAS = 2.0
 """Standard deviations in a stated uncertainty: 95 % of a Gaussian."""
+TINY = float(np.finfo(float).tiny)
 LEAST_WEIGHT = 1e-3
 """Weight below which a robust solver counts as having left an edge out: some keep a small rest."""
 
@@ -45,30 +46,55 @@ def pose_change(graph: ViewGraph, solution: Solution, before: Floats) -> PoseCha
 
 
 def moves(before: Floats, after: Floats) -> Floats:
-    """How far (B, 2) each body turned (radians) and moved, the poses before (B, 4, 4) rigidly aligned to those after.
+    """How far (B, 2) each body turned (radians) and moved from the poses before (B, 4, 4), see `_motions`."""
+    return np.asarray(np.linalg.norm(_motions(before, after).reshape(-1, 2, 3), axis=2))
+
+
+def _motions(before: Floats, after: Floats) -> Floats:
+    """ξ (B, 6) of each body from the poses before (B, 4, 4), rigidly aligned, to those after.
 
     The rotation is aligned by orientations, since a few positions may leave it open.
     """
     turn = se3.project_to_so3((after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2)).sum(axis=0))
     shift = (after[:, :3, 3] - before[:, :3, 3] @ turn.T).mean(axis=0)
-    moved = se3.log(se3.inverse(se3.from_parts(turn, shift) @ before) @ after)
-    return np.asarray(np.linalg.norm(moved.reshape(-1, 2, 3), axis=2))
+    return np.asarray(se3.log(se3.inverse(se3.from_parts(turn, shift) @ before) @ after))
 
 
 def told_apart(start: TrackedModel, model: TrackedModel) -> bool:
-    """Whether the model, of the start's size, moved by more than its uncertainty, in the mean or the median.
+    """Whether the model, of the start's size, is nearer to the truth than the start as far as its move tells.
 
-    A model that moved by less may be farther from the truth than the start: both errors add up to the move. What the
-    model has more parallax than the start, in the median, does not count: of points at infinity an adjustment may make
-    near ones, which seem to fix poses well. Bodies that tracks do not fix take no part.
+    Where poses move by d, the start errs by τ² and tracks by v, the squared error falls by d² (τ² − v) / (τ² + v) in
+    the mean: poses must gain more in directions that tracks fix than they lose in those left open, as in the bend of a
+    long row. τ is half of the RMS move, of rotations and of positions: where all directions are alike, poses must move
+    by two standard errors. What the model has more parallax than the start, in the median, does not count: of points at
+    infinity an adjustment may make near ones, which seem to fix poses well. Bodies that tracks do not fix take no part.
     """
-    moved, known = _moved_and_known(start, model)
-    before, after = (float(np.median(one.quality.parallaxes_deg)) for one in (start, model))
-    known = known * max(1.0, after / max(before, np.finfo(float).tiny))
-    fixed = np.isfinite(known).all(axis=1)
-    moved, known = moved[fixed], known[fixed]
-    total = (moved**2).sum(axis=0) > SIGMAS**2 * (known**2).sum(axis=0)
-    return bool(fixed.any()) and bool((total | (np.median(moved / known, axis=0) > SIGMAS)).any())
+    told = model.information
+    if not told.fixed.any():
+        return False
+    after = model.world_from_body[told.fixed]
+    motions = _motions(start.world_from_body[told.fixed], after)
+    usual = np.sqrt((motions.reshape(-1, 2, 3) ** 2).mean(axis=(0, 2))) / SIGMAS
+    scale = np.tile(np.repeat(np.maximum(usual, np.finfo(float).eps), 3), len(after))
+    moved = _without_gauge(motions.ravel() / scale, after, scale)
+    before_deg, after_deg = (float(np.median(one.quality.parallaxes_deg)) for one in (start, model))
+    nearer = max(1.0, after_deg / max(before_deg, TINY))
+    gain, size = float(moved @ moved), told.groups.shape[-1]
+    for group, own, part in zip(told.groups, moved.reshape(-1, size), scale.reshape(-1, size), strict=True):
+        open_to_doubt = np.eye(size) + group * np.outer(part, part) / nearer**2
+        gain -= 2.0 * float(own @ np.linalg.solve(open_to_doubt, own))
+    return gain > 0
+
+
+def _without_gauge(moved: Floats, world_from_body: Floats, scale: Floats) -> Floats:
+    """Moves (6 B,), each divided by its `scale`, less what the whole turned, shifted and grew by."""
+    turned = np.swapaxes(world_from_body[:, :3, :3], 1, 2)
+    centres = world_from_body[:, :3, 3] - world_from_body[:, :3, 3].mean(axis=0)
+    whole = np.zeros((len(turned), 6, 7))
+    whole[:, :3, :3], whole[:, 3:, :3] = turned, -turned @ se3.hat(centres)
+    whole[:, 3:, 3:6], whole[:, 3:, 6] = turned, np.einsum("bij,bj->bi", turned, centres)
+    basis = np.linalg.qr(whole.reshape(-1, 7) / scale[:, None])[0]
+    return np.asarray(moved - basis @ (basis.T @ moved))
 
 
 def loose(start: TrackedModel, model: TrackedModel) -> Bools:
@@ -83,8 +109,8 @@ def loose(start: TrackedModel, model: TrackedModel) -> Bools:
 
 def _moved_and_known(start: TrackedModel, model: TrackedModel) -> tuple[Floats, Floats]:
     """Moves and standard errors (B, 2) of rotation and position, over three axes; infinite where tracks tell none."""
-    known = np.sqrt(3) * np.nan_to_num(model.standard_errors(), nan=np.inf)
-    return moves(start.world_from_body, model.world_from_body), np.maximum(known, np.finfo(float).tiny)
+    known = np.sqrt(3) * np.nan_to_num(model.information.standard_errors, nan=np.inf)
+    return moves(start.world_from_body, model.world_from_body), np.maximum(known, TINY)
 
 
 def _sigmas(graph: ViewGraph, solution: Solution, used: Ints, rows: Ints) -> tuple[float, float]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, TypeAlias
 
 from hodge_pipeline.types import Bools, CloudSet, Floats, Frame, Ints, ModelQuality, PositionPriors, ViewGraph
+from hodge_pipeline.types.pose_information import PoseInformation
 
 Adjusted: TypeAlias = Literal["nothing", "points", "all"]
 """What an adjustment moves: nothing, points alone, or points and bodies."""
@@ -126,8 +127,9 @@ class TrackedModel(Protocol):
     def moves_calibration(self) -> bool:
         """Whether that adjusts the cameras' intrinsics, or their places in rigs, too."""
 
-    def standard_errors(self) -> Floats:
-        """Standard errors (B, 2) of each body's rotation and position, radians and units."""
+    @property
+    def information(self) -> PoseInformation:
+        """What the tracks tell of the bodies' poses."""
 
     def held_out_errors(self, entries: Bools, adjusts: Adjusted) -> Floats:
         """Errors (H,) in pixels of the observations chosen from the N of `quality`, after an adjustment without them of

@@ -34,7 +34,7 @@ from hodge_adapters.colmap.records import Model
 from hodge_adapters.colmap.resection import resected
 from hodge_adapters.colmap.scale import seen_depths
 from hodge_adapters.colmap.ties import apart_matches, merge_matched_points
-from hodge_adapters.colmap.uncertainty import standard_errors
+from hodge_adapters.colmap.uncertainty import information
 from hodge_pipeline import se3
 from hodge_pipeline.types import (
     Bools,
@@ -47,6 +47,7 @@ from hodge_pipeline.types import (
     PositionPriors,
     ViewGraph,
 )
+from hodge_pipeline.types.pose_information import PoseInformation
 from hodge_pipeline.types.text import counted
 from hodge_pipeline.types.tracked_model import Adjusted
 
@@ -332,13 +333,10 @@ class ColmapModel:
         keypoints = self.quality.keypoints[np.isinf(self.quality.errors_px)]
         return [(self.records.images[row].image_id, int(column)) for row, column in keypoints]
 
-    def standard_errors(self) -> Floats:
-        """Of each body's rotation and position (B, 2), radians and units; see `uncertainty.standard_errors`."""
-        return self._standard_errors
-
     @cached_property
-    def _standard_errors(self) -> Floats:
-        return standard_errors(self.records, self.bodies)
+    def information(self) -> PoseInformation:
+        """What the tracks tell of the bodies' poses; see `uncertainty.information`."""
+        return information(self.records, self.bodies)
 
     def held_out_errors(self, entries: Bools, adjusts: Adjusted) -> Floats:
         """Errors (H,) of these entries of tracks (T,) after an adjustment without them of nothing, the points or all.

@@ -1,4 +1,4 @@
-"""How well the tracks of a COLMAP model fix its bodies: the covariance of bundle adjustment, poses alone."""
+"""How well the tracks of a COLMAP model fix its bodies: the normal matrix of bundle adjustment, of poses alone."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from hodge_adapters.colmap.points import error_cap, reprojection_errors
 from hodge_adapters.colmap.records import Model
 from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types.pose_information import GAUGE, PoseInformation
 
-GAUGE = 7
-"""Turn, shift and size of the whole, which no track tells."""
 MOST_BODIES_JOINTLY = 300
 """Above it the joint covariance (6 B)² costs too much: each body is then taken given all others, which is too sure."""
 MOST_POINTS_AT_ONCE = 16384
@@ -37,31 +36,23 @@ class _Rows:
     point: Ints
 
 
-def standard_errors(model: Model, bodies: Bodies) -> Floats:
-    """Standard errors (B, 2) of each body's rotation (rad) and position (units): roots of the mean variance of 3 axes.
+def information(model: Model, bodies: Bodies) -> PoseInformation:
+    """What the tracks tell of the bodies' poses, whatever their points are.
 
-    From the size of the residuals, wrong observations left out (see `error_cap`); in the gauge in which the bodies as a
-    whole stay where they are. NaN without tracks, and of a body with fewer than `LEAST_SEEN` observations, which takes
-    no part: what is free beside the gauge would be mistaken for it.
+    From the size of the residuals, wrong observations left out (see `error_cap`). A body with fewer than `LEAST_SEEN`
+    observations takes no part: what is free beside the gauge would be mistaken for it.
     """
     errors_px, body = reprojection_errors(model), bodies.body_of_image[model.image_rows]
     right = errors_px <= error_cap(errors_px)
-    out = np.full((len(bodies.frame_ids), 2), np.nan)
-    seen = np.bincount(body[right], minlength=len(out)) >= LEAST_SEEN
+    seen = np.bincount(body[right], minlength=len(bodies.frame_ids)) >= LEAST_SEEN
     used, count = right & seen[body], int(seen.sum())
     points = np.count_nonzero(np.bincount(model.points.owners[used]))
     freedom = 2 * int(used.sum()) - 6 * count - 3 * points + GAUGE
     if freedom <= 0 or not points:
-        return out
-    variance = float((errors_px[used] ** 2).sum()) / freedom
+        return PoseInformation(np.zeros(len(seen), bool), np.zeros((0, 6, 6)))
+    variance = max(float((errors_px[used] ** 2).sum()) / freedom, np.finfo(float).tiny)
     schur = _schur(model, bodies, used, np.cumsum(seen) - 1, count)
-    if count <= MOST_BODIES_JOINTLY:
-        blocks = _inverse_without_gauge(schur).reshape(count, 6, count, 6)[np.arange(count), :, np.arange(count)]
-    else:
-        blocks = np.asarray(np.linalg.pinv(schur, hermitian=True), np.float64)
-    variances = variance * np.diagonal(blocks, axis1=1, axis2=2).reshape(count, 2, 3).mean(axis=2)
-    out[seen] = np.sqrt(np.maximum(variances, 0.0))
-    return out
+    return PoseInformation(seen, (schur[None] if schur.ndim == 2 else schur) / variance)
 
 
 def _schur(model: Model, bodies: Bodies, used: Bools, number_of: Ints, count: int) -> Floats:
@@ -107,14 +98,6 @@ def _roots_of_point_covariances(model: Model, bodies: Bodies, used: Bools) -> Fl
     of_point = normal.reshape(-1, 3, 3)
     of_point += 1e-9 * np.trace(of_point, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-300 * np.eye(3)
     return np.asarray(np.linalg.cholesky(np.linalg.inv(of_point)))
-
-
-def _inverse_without_gauge(matrix: Floats) -> Floats:
-    """The pseudo-inverse without the directions that are free; lengths count as angles, which suits unit scenes."""
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    kept = np.arange(len(values)) >= GAUGE
-    kept &= values > 1e-12 * values[-1]
-    return np.asarray((vectors[:, kept] / values[kept]) @ vectors[:, kept].T)
 
 
 def _derivatives(model: Model, bodies: Bodies, used: Bools) -> Iterator[tuple[int, _Rows]]:
