@@ -11,9 +11,13 @@ import pytest
 
 import hodge_pipeline
 from colmap_data import FREE, noisy, synthetic
+from hodge_adapters.colmap.cameras import colmap_camera
 from hodge_adapters.colmap.content import read_model
 from hodge_adapters.colmap.models import ColmapModels
-from hodge_adapters.colmap.scale import seen_depths
+from hodge_adapters.colmap.points import with_points
+from hodge_adapters.colmap.records import NO_POINT, Model
+from hodge_adapters.colmap.scale import other_camera_note, seen_depths
+from hodge_adapters.images import pixels
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.refine.scale import metric_scale
@@ -35,6 +39,40 @@ def test_depth_that_tells_no_scale_is_a_doubt_and_depth_that_cannot_be_read_an_e
     synthetic(tmp_path)
     with pytest.raises(SourceError, match="0.png: depth must be uint16"):
         seen_depths(read_model(tmp_path / "binary")[1], {0: file}, 1000.0, (0,))
+
+
+def sensor_depth(model: Model, row: int, factor: float, seed: int) -> Floats:
+    """Metres of an image: chance but where its points are seen through so many times its focal length."""
+    image, record = model.images[row], model.cameras[model.images[row].camera_id]
+    out = np.random.default_rng([seed, row]).uniform(1.0, 9.0, (record.height, record.width))
+    camera, seen = colmap_camera(record), image.point_ids != NO_POINT
+    focal = factor * np.array([camera.focal_length_x, camera.focal_length_y])
+    rays = np.asarray(camera.cam_from_img(image.pixels[seen]))
+    columns, rows = np.floor(rays * focal + [camera.principal_point_x, camera.principal_point_y]).astype(int).T
+    inside = (columns >= 0) & (rows >= 0) & (columns < record.width) & (rows < record.height)
+    xyz = model.points.xyz[model.points.rows_of(image.point_ids[seen])]
+    out[rows[inside], columns[inside]] = 2.0 * se3.transform(se3.inverse(image.world_from_cam), xyz)[inside, 2]
+    return out
+
+
+def test_depth_of_another_camera_is_told_by_many_points_and_each_image_is_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synthetic(tmp_path)
+    model, read = read_model(tmp_path / "binary")[1], list[int]()
+    sensors, few = {row: Path(str(row)) for row in range(8)}, np.arange(len(model.points.ids)) < 12
+
+    def told(model: Model, factor: float, seed: int) -> str:
+        def depth(path: Path, **_: object) -> Floats:
+            read.append(int(path.name))
+            return sensor_depth(model, read[-1], factor, seed)
+
+        monkeypatch.setattr(pixels, "read_depth", depth)
+        return other_camera_note(model, sensors, 1000.0, ()) or ""
+
+    assert told(model, 1.0, 0) == "" and read == list(range(8))
+    assert "with a focal length 1.1 times theirs: give --depth-camera" in told(model, 1.1, 0)
+    assert not any(told(with_points(model, few), 9.0, seed) for seed in range(8)), "by chance some fit well"
 
 
 def test_scale_is_the_median_with_the_error_of_the_images_medians() -> None:

@@ -132,7 +132,7 @@ class ColmapModels:
             files=content.files,
             refine=self.refine,
             known=self._known(database, notes),
-            tracks=content,
+            content=content,
             notes=tuple(notes),
         )
         return self._with_camera_note(model)
@@ -229,4 +229,5 @@ def _joined(whole: ColmapModel, other: ColmapModel) -> ColmapModel | None:
         files=(),
         notes=(*whole.notes, *(line for line in other.notes if line not in whole.notes), note),
         tracks=None,
+        content=None,
     ).merged()

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -107,6 +107,8 @@ class ColmapModel:
     """What gave the model its place in the world, empty where nothing did."""
     tracks: Model | None = None
     """The content of a model with the same tracks, from which this one differs by poses and positions alone."""
+    content: Model | None = None
+    """The content of this very model, where that is known: pycolmap gives it point by point."""
 
     @property
     def native(self) -> pycolmap.Reconstruction:
@@ -122,6 +124,8 @@ class ColmapModel:
     @cached_property
     def records(self) -> Model:
         """The model as plain arrays, images in natural order of their names."""
+        if self.content is not None:
+            return self.content
         return content_of(self.reconstruction) if self.tracks is None else refreshed(self.tracks, self.reconstruction)
 
     @cached_property
@@ -232,13 +236,13 @@ class ColmapModel:
             return replace(self, notes=(*self.notes, found))
         copy = self._copy()
         copy.transform(found.world_from_model)
-        return replace(self, reconstruction=copy, files=(), tracks=self.records, placing=found.told)
+        return self._of(copy, self.records, placing=found.told)
 
     def scaled(self, factor: float, motion: Floats | None = None) -> ColmapModel:
         """Positions times the factor, then the whole moved by `motion` (4, 4)."""
         before, copy, moved = self.records, self._copy(), np.eye(4) if motion is None else motion
         copy.transform(pycolmap.Sim3d(factor, pycolmap.Rotation3d(moved[:3, :3]), moved[:3, 3]))
-        return self._with(copy, refreshed(before, copy, se3.transform(moved, factor * before.points.xyz)))
+        return self._of_content(copy, refreshed(before, copy, se3.transform(moved, factor * before.points.xyz)))
 
     def moved(self, world_from_body: Floats) -> ColmapModel:
         """Bodies at these poses, points where their rays meet; what the database matched is merged where it fits."""
@@ -250,7 +254,7 @@ class ColmapModel:
         for point_id, place in zip(before.points.ids.tolist(), xyz, strict=True):
             points[point_id].xyz = place
         update_errors(copy)
-        return self._with(copy, refreshed(before, copy, xyz))
+        return self._of_content(copy, refreshed(before, copy, xyz))
 
     def thinned(self, most_seen: int) -> ColmapModel:
         """A random part of the tracks, of which each image sees so many, or all of its own; this very model where no
@@ -263,7 +267,7 @@ class ColmapModel:
         copy = self._copy()
         for point_id in records.points.ids[~kept].tolist():
             copy.delete_point3D(point_id)
-        return self._with(copy, with_points(records, kept))
+        return self._of_content(copy, with_points(records, kept))
 
     def merged(self) -> ColmapModel:
         """What the database matched is one point where one position fits; this very model where nothing is merged."""
@@ -276,7 +280,7 @@ class ColmapModel:
             return self
         update_errors(copy)
         notes = (*self.notes, f"{counted(count, 'pair')} of points that a match calls one were merged")
-        return replace(self, reconstruction=copy, files=(), notes=notes, tracks=None)
+        return self._of(copy, None, notes=notes)
 
     def adjusted(
         self, priors: PositionPriors | None = None, *, move_bodies: bool = True, near_optimum: bool = False
@@ -313,7 +317,7 @@ class ColmapModel:
                 if point_id in loose:
                     copy.points3D[point_id].xyz = xyz
         update_errors(copy)
-        return replace(self, reconstruction=copy, files=(), tracks=self.records)
+        return self._of(copy, self.records)
 
     def with_robust_loss(self) -> ColmapModel:
         """The same model, whose adjustments let an observation that is far off pull little."""
@@ -367,13 +371,16 @@ class ColmapModel:
         # merging alone changes tracks, and leaves fewer points
         tracks = self.records if back.num_points3D() == self.reconstruction.num_points3D() else None
         notes = *notes, *calibration_changes(self.reconstruction, back, self.refine)
-        return replace(self, reconstruction=back, files=(), notes=notes, tracks=tracks)
+        return self._of(back, tracks, notes=notes)
 
-    def _with(self, reconstruction: pycolmap.Reconstruction, records: Model) -> ColmapModel:
-        """The same model of another reconstruction, whose content is known: pycolmap gives it point by point."""
-        out = replace(self, reconstruction=reconstruction, files=(), tracks=records)
-        vars(out)["records"] = records
-        return out
+    def _of(self, reconstruction: pycolmap.Reconstruction, tracks: Model | None, **changes: Any) -> ColmapModel:
+        """The same model of another reconstruction, with the tracks of this content; None: tracks that it has alone."""
+        known = {"files": (), "content": None, **changes}
+        return replace(self, reconstruction=reconstruction, tracks=tracks, **known)
+
+    def _of_content(self, reconstruction: pycolmap.Reconstruction, content: Model) -> ColmapModel:
+        """The same model of another reconstruction, which has this content."""
+        return self._of(reconstruction, content, content=content)
 
     def _copy(self) -> pycolmap.Reconstruction:
         return pycolmap.Reconstruction(self.reconstruction)
