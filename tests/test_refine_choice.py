@@ -117,7 +117,10 @@ def test_poses_that_tracks_hardly_fix_stay(sigma: float, nearer: float, row: int
     choice = choose(candidates, no_depth, 0, NO_STEPS)
     assert choice.row == row and (choice.refused == UNTOLD) == (row == 0)
     told = refused_doubt(candidates, choice, no_depth)
-    assert told == ("" if row else f"in doubt, since bundle fits much better (3.50 → 0.60 px), but {UNTOLD}")
+    assert told == ("" if row else "in doubt, since bundle fits much better (3.50 → 0.60 px)"), "the reason says why"
+    if not row:
+        told = refused_doubt(candidates, replace(choice, reason=""), no_depth)
+        assert told.endswith(f"(3.50 → 0.60 px), but {UNTOLD}"), "where points alone are adjusted it gives no reason"
 
 
 def test_one_image_that_tracks_hardly_fix_is_told_and_does_not_keep_the_others_from_better_poses() -> None:

@@ -116,6 +116,7 @@ def test_poses_are_in_doubt_where_most_observations_are_off_whatever_else_fits()
     given, *others = costs([quality(flat(913.0))], [quality(flat(0.1)), quality(half)])
     assert given.doubt == "in doubt, since 100% of the observations are more than 4 px off"
     assert [cost.doubt for cost in others] == ["", ""]
+    assert replace(given, px=4.0 + 1e-12).doubt == given.doubt, "a mean of the cap rounds up or down"
 
 
 def test_of_candidates_at_one_optimum_the_first_is_kept() -> None:

@@ -97,7 +97,7 @@ def refused_doubt(found: CandidateSet, choice: Choice, distances_m: Floats) -> s
     if not _gain(found, at) >= CLEAR_GAIN:
         return ""
     error = " → ".join(alike(kept, found.costs[at].px, 3))
-    told = f", but {UNTOLD}" if choice.refused == UNTOLD else ""
+    told = f", but {UNTOLD}" if choice.refused == UNTOLD != choice.reason else ""
     return f"in doubt, since {found.candidates[at].name} fits much better ({error} px){told}"
 
 

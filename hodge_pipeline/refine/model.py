@@ -143,10 +143,10 @@ def _refine(
     cost = found.costs[at]
     doubt = (
         intrinsics_doubt(found, steps)
+        or refused_doubt(found, choice, distances_m)
         or cost.doubt
         or cost.images_doubt
         or spoilt_doubt(found.costs[0], cost)
-        or refused_doubt(found, choice, distances_m)
         or ("" if found.depth.graph.edge_count or in_world else pieces_doubt(model))
     )
     doubt = doubt or (_loose_doubt(start, model) if not found.candidates[at].holds_poses and not is_metric else "")

@@ -63,7 +63,7 @@ class ReprojectionCost:
     @property
     def doubt(self) -> str:
         """Why these poses may be wrong although no candidate fits better; "" where nothing says so."""
-        if self.px > CONTRADICTING_PX:
+        if self.px > (1 + SAME_COST) * CONTRADICTING_PX:  # a mean of that cap rounds up or down
             off = f"tracks contradict each other by {self.px:.3g} px (merged wrongly, or cameras are wrong)"
         elif self.beyond > OFF_SHARE:
             off = f"{self.beyond:.0%} of the observations are more than {self.cap_px:.3g} px off"
