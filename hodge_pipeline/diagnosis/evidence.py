@@ -20,7 +20,7 @@ FLOOR, CEILING = 0.05, 0.98
 FAR_SHARE = 0.25
 """Pairs further apart than this share of the vertices give the rate at which any two views are joined."""
 LEAST_ODDS = 2.0
-"""Least odds ratio of neighbours against far pairs to be joined, for the order to count."""
+"""Least odds ratio of neighbours against far pairs to be joined, or against all to be right, for the order to count."""
 DOUBTED = 2
 """Unjoined neighbours that are added to those counted: of few views all may be joined by chance."""
 ROUNDS = 30
@@ -64,32 +64,11 @@ def order_prior(edges: Ints, vertex_count: int) -> Floats:
     return np.asarray(share[place])
 
 
-def prior_by_cycles(edges: Ints, vertex_count: int, cycles: Cycles) -> Floats:
-    """The probability (E,) that an edge is right, from its gap and from the triangles that close: where all pairs are
-    joined, the rate of joined pairs is uninformative.
-
-    A triangle closes where its three edges are right, so that each gap's share is that of its triangles that close
-    over what the other two edges let expect. All are equal where neighbours are hardly more often right.
-    """
-    place, bounds = _gap_classes(edges, vertex_count)
-    triangles = np.flatnonzero(cycles.loops.lengths == 3)
-    sides = place[cycles.loops.select(triangles).edge.reshape(-1, 3)]
-    closing = np.bincount(sides.ravel(), np.repeat(cycles.closes[triangles], 3), len(bounds))
-    share = np.full(len(bounds), 0.5)
-    for _ in range(ROUNDS):
-        others = share[sides[:, [1, 0, 0]]] * share[sides[:, [2, 2, 1]]]
-        expected = np.bincount(sides.ravel(), others.ravel(), len(bounds))
-        observed = np.clip(closing / np.maximum(expected, 1e-9), FLOOR, CEILING)
-        share = np.sqrt(share * observed)  # half a step, since whole ones swing
-    odds = share / (1 - share)
-    is_informative = bool(len(triangles)) and odds[0] >= LEAST_ODDS * odds[place].mean()
-    return share[place] if is_informative else np.full(len(edges), 0.5)
-
-
 def right_by_gap(edges: Ints, vertex_count: int, cycles: Cycles, usual: float) -> Floats:
     """The probability (E,) that an edge is right, from the cycles that close over edges of its gap |i − j|.
 
-    For graphs of which registration has left out bad edges already, so that the rate of joined pairs is uninformative.
+    For graphs in which the rate of joined pairs is uninformative: all pairs are joined, or registration has left out
+    bad edges already.
     `usual` holds where no cycle passes. No share exceeds what the number of edges of a gap can support: of n
     edges none of which fails the next one is right with (n + 1) / (n + 2) (Laplace's rule of succession).
     """
@@ -109,6 +88,14 @@ def right_by_gap(edges: Ints, vertex_count: int, cycles: Cycles, usual: float) -
     usual = float(np.clip(usual, FLOOR, CEILING))
     logit = trust * np.log(share / (1 - share)) + (1 - trust) * np.log(usual / (1 - usual))
     return np.asarray(expit(logit[place]))
+
+
+def _if_neighbours_stand_out(edges: Ints, prior: Floats) -> Floats:
+    """The prior (E,), or one half for all where neighbours are hardly more often right."""
+    near = np.abs(edges[:, 1] - edges[:, 0]) == 1
+    share, usual = float(prior[near].mean()) if near.any() else 0.0, float(prior.mean())
+    stand_out = share / (1 - share) >= LEAST_ODDS * usual / (1 - usual)
+    return prior if stand_out else np.full(len(edges), 0.5)
 
 
 def every_pair_tried(edges: Ints, vertex_count: int) -> bool:
@@ -178,14 +165,14 @@ def gather(graph: ViewGraph, options: DiagnosisOptions) -> tuple[Evidence, Cycle
     noise = edge_noise(graph, there, loops, *errors, prior, reach_m)
     cycles = judge_cycles(loops, *errors, noise, reach_m)
     exhaustive = every_pair_tried(edges, count)
-    if exhaustive and options.order_prior and np.ptp(prior) == 0:
-        prior = prior_by_cycles(edges, count, cycles)
-        noise = edge_noise(graph, there, loops, *errors, prior, reach_m)
-        cycles = judge_cycles(loops, *errors, noise, reach_m)
+    usual = usual_share(cycles)
     if not exhaustive:
         # the rate of joined pairs is no measure of wrong edges then; the cycles are
-        usual = usual_share(cycles)
         prior = right_by_gap(edges, count, cycles, usual) if options.order_prior else np.minimum(prior, usual)
+    elif options.order_prior and np.ptp(prior) == 0:
+        prior = _if_neighbours_stand_out(edges, right_by_gap(edges, count, cycles, usual))
+        noise = edge_noise(graph, there, loops, *errors, prior, reach_m)
+        cycles = judge_cycles(loops, *errors, noise, reach_m)
     support = closing_support(cycles, prior)
     weight = prior / (1 - prior) * (0.5 + support) / (1 + support)
     weight *= 1 + TIE_BREAK * np.random.default_rng(options.seed).random(len(weight))
