@@ -90,9 +90,9 @@ def test_many_right_places_are_not_outnumbered_by_wrong_loops(monkeypatch: pytes
     met = list[tuple[Places, Linear]]()
     best = Places.best
 
-    def noted(places: Places, linear: Linear, enough: float) -> tuple[Arrangement, bool]:
+    def noted(places: Places, linear: Linear) -> Arrangement:
         met.append((places, linear))
-        return best(places, linear, enough)
+        return best(places, linear)
 
     monkeypatch.setattr(Places, "best", noted)
     assert find_backbone(drive(count=3000, world="town", loops=150, wrong=0.3).graph) is not None
@@ -101,8 +101,8 @@ def test_many_right_places_are_not_outnumbered_by_wrong_loops(monkeypatch: pytes
     count = int(places.used.sum())
     # so much that each is less likely than one of the 18,000, but not all of them together
     monkeypatch.setattr(Places, "_density", lambda places, fit: 10.0 * len(fit.reduced.active))
-    found, sure = best(places, linear, 3.0)
-    assert sure and found.right.sum() == count > 20 and found.log_odds < 0
+    found = best(places, linear)
+    assert found.of_all > 3.0 and found.right.sum() == count > 20 and found.log_odds < 0
     assert found.log_ways == pytest.approx(np.log(np.arange(1, count + 1)).sum())
 
 
@@ -145,9 +145,9 @@ def test_a_loop_of_a_right_place_that_the_poses_contradict_does_not_count(monkey
         places = of(start, *others)
         return replace(places, members=np.where(made.right[start.chain.loop_edge], places.members, 0))
 
-    def without_a_place(places: Places, linear: Linear, enough: float) -> tuple[Arrangement, bool]:
-        found, sure = best(places, linear, enough)
-        return replace(found, right=found.right & (np.arange(len(found.right)) + 1 < len(found.right))), sure
+    def without_a_place(places: Places, linear: Linear) -> Arrangement:
+        found = best(places, linear)
+        return replace(found, right=found.right & (np.arange(len(found.right)) + 1 < len(found.right)))
 
     monkeypatch.setattr(Places, "of", with_wrong_loops)
     monkeypatch.setattr(Places, "best", without_a_place)

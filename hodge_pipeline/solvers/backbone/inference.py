@@ -115,8 +115,8 @@ class _Trial:
             if not agreed.any() or (judged.factor[agreed] - np.log(agreed.sum())).sum() <= by_chance(int(agreed.sum())):
                 break
             places = Places.of(start, self.alone, agreed, self.outliers)
-            best, confirmed = places.best(linear, enough)
-            confirmed = confirmed and places.chance(best.right) + fold < -BY_CHANCE
+            best = places.best(linear)
+            confirmed = best.of_all > enough and places.chance(best.right) + fold < -BY_CHANCE
             used = np.append(best.right, False)[places.members]
             if (used == before).all() or not confirmed:
                 break

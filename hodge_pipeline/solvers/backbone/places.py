@@ -30,8 +30,6 @@ MISTAKEN_PLACES = 0.2
 """Expected number of mistaken places to a right one, beside the rivals that are not used. With more, a path that closes
 once would stay open: its loops can show little more than that the drift is as stated.
 """
-ROUNDS = 6
-"""Rounds in which places that agree with the strongest are found: a limit on cost."""
 MOST_TRIED = 3
 """Places left out or added on trial each time, and groups of loops that may be added: limits on cost."""
 CLEARLY = float(np.log(20.0))
@@ -164,30 +162,11 @@ class Places:
         rows = fit.reduced.active
         return self.outliers.at(self.start.chain, rows, fit.loops[0]).log_density(by_path(self.start, rows))
 
-    def best(self, linear: Linear, enough: float) -> tuple[Arrangement, bool]:
-        """The likeliest arrangement, searched from all used places, whose poses are near `linear`, and, if its log-odds
-        are not `enough`, from the place with the strongest evidence; and whether its log-odds are enough.
+    def best(self, linear: Linear) -> Arrangement:
+        """The likeliest arrangement, from all used places, whose poses are near `linear`, by leaving out or adding
+        single places while the log-odds rise.
         """
-        found = self._improved(self.arranged(self.used, linear))
-        if found.of_all <= enough:
-            other = self._improved(self.arranged(self._agreeing_with_strongest(enough), self.start))
-            found = max(found, other, key=lambda each: each.of_all)
-        return found, found.of_all > enough
-
-    def _agreeing_with_strongest(self, enough: float) -> Bools:
-        """The place with the strongest evidence by itself, and those (K,) that agree with it and each other."""
-        by_itself = np.where(self.used, self.bare - self.rivals(self.used), -np.inf)
-        right = strongest = np.arange(len(self.loop)) == np.argmax(by_itself)
-        for _ in range(ROUNDS):
-            fit = optimised(Fit(thinned(self.start.chain, self.loop[right]), self.start), MOST_STEPS)
-            factor = judge(fit.linear, fit, EVEN, self.outliers).factor[self.loop] - self.rivals(right)
-            before, right = right, (self.used & (factor > enough)) | strongest
-            if (before == right).all():
-                break
-        return np.asarray(right)
-
-    def _improved(self, found: Arrangement) -> Arrangement:
-        """The arrangement after leaving out or adding single places while the log-odds rise."""
+        found = self.arranged(self.used, linear)
         changes = self._changes(found)
         while changes:
             tried = self.arranged(changes.pop(0), found.fit.linear)
