@@ -16,8 +16,10 @@ from hodge_pipeline.recording.shapes import up_and_ahead
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.contents import EdgeRow, Pictures, Report, SourceSummary, paths_of
 from hodge_pipeline.report.painting import turns_deg
+from hodge_pipeline.report.run_report import _pictures
 from hodge_pipeline.report.scene_pictures import changed_most, four_sides, worst_pairs
-from hodge_pipeline.types import CloudSet, Floats, Frame, PointCloud, Source
+from hodge_pipeline.scene import KeyFrames, Round, Scene, pose_sets
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, PointCloud, Solution, Source, ViewGraph
 
 pytestmark = pytest.mark.draws
 RED, BLUE = (200, 0, 0), (0, 0, 200)
@@ -175,3 +177,20 @@ def test_the_rotation_error_of_each_frame_is_that_of_its_pose() -> None:
     before = replace(paths[1], positions=paths[1].positions + 1.0)
     moved = replace(report, pictures=Pictures(paths=(before, paths[2])))
     np.testing.assert_allclose(turns_deg(moved)["result"], [20, 10, 10, np.nan, 20], atol=1e-6)
+
+
+@pytest.mark.parametrize(("joined_before", "moved_m"), [(False, 0.0), (True, 5.0)])
+def test_pieces_that_the_start_laid_apart_have_not_moved_by_that(joined_before: bool, moved_m: float) -> None:
+    clouds, poses = room()
+    before, chain = poses.copy(), np.stack([np.arange(5), np.arange(1, 6)], axis=1)
+    before[3:, 1, 3] += 10.0
+    measured = Edges.measured(ViewGraph.from_edges(np.arange(6), chain, np.tile(np.eye(4), (5, 1, 1))))
+    first = Round(measured if joined_before else measured.select(np.arange(5) != 2), np.arange(6), before)
+    solved = Solution(poses, np.zeros(6, np.int64), np.ones(5))
+    rounds = [first, Round(measured, np.arange(6), poses, solved)]
+    source = Source("room", Path("room"), [Frame(row, float(row)) for row in range(6)])
+    scene = Scene(source, source, KeyFrames.all_of(source, before), clouds, first)
+    drawn = _pictures(scene, rounds, pose_sets(rounds, source), solved.component, ())
+    shown = {path.name: path.positions for path in drawn.paths}
+    assert np.linalg.norm(shown["odometry"] - shown["result"], axis=1).max() == pytest.approx(moved_m, abs=1.0)
+    assert len(np.unique(drawn.component)) == (1 if joined_before else 2)

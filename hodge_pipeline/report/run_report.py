@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from hodge_pipeline import registry, se3
+from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.trajectory import absolute_error
@@ -177,25 +178,39 @@ def _loop_rows(solution: Solution) -> tuple[LoopRow, ...]:
     return tuple(rows)
 
 
+def _held_by_both(component: Ints, first: Round, *, is_start: bool) -> Ints:
+    """Labels (N,) of the frames that both the result (its `component`) and the edges of the start hold together; given
+    poses have no edges, and are one whole.
+    """
+    if not is_start or not len(first.graph_edges):
+        return component
+    of_start = connected_components(first.graph_edges.pairs, len(component))
+    return np.unique(np.stack([component, of_start]), axis=1, return_inverse=True)[1].reshape(-1)
+
+
 def _pictures(
     scene: Scene, rounds: Sequence[Round], sets: Mapping[str, Floats], component: Ints, worst: Sequence[EdgeRow]
 ) -> Pictures:
-    """What is drawn; paths are aligned to the truth, or the first one to the result where there is none."""
+    """What is drawn; paths are aligned to the truth, or the first one to the result where there is none: piece by piece
+    as both have them, since how the start lays its pieces apart is no measure of anything.
+    """
     last, source, clouds = rounds[-1], scene.source, scene.clouds
     first = next(iter(sets))
     before, after = sets[first], sets["result"]
     shown = {first: before, "result": after}
+    held = component
     if has_truth(source):
         truth = true_poses(source)
         aligned = {name: absolute_error(poses, truth, component).aligned for name, poses in shown.items()}
         shown = {"truth": truth, **aligned}
     else:
-        shown[first] = absolute_error(before, after, component).aligned
+        held = _held_by_both(component, rounds[0], is_start=before is rounds[0].world_from_cam)
+        shown[first] = absolute_error(before, after, held).aligned
     is_clocked = has_real_stamps(source.frames)
     finite = next(name for name, poses in sets.items() if np.isfinite(poses).all())
     return Pictures(
         paths=paths_of(shown),
-        component=component,
+        component=held,
         residuals=tuple(Residuals(name, *edge_residuals(last.graph, sets[name])) for name in (finite, "result")),
         graph=last.graph,
         convergence={
@@ -205,7 +220,7 @@ def _pictures(
         },
         names=tuple(str(frame.frame_id) for frame in source.frames),
         stamps_s=np.array([frame.stamp_s for frame in source.frames if is_clocked]),
-        changed_most=changed_most(clouds, before, after, last.graph.edges, last.vertex_ids.tolist(), component),
+        changed_most=changed_most(clouds, before, after, last.graph.edges, last.vertex_ids.tolist(), held),
         sides=four_sides(clouds, before, after, component),
         worst_pairs=worst_pairs(source, worst),
     )
