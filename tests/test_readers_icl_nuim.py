@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from hodge_adapters.icl_nuim.pov import read_pose, read_ray_lengths
 from hodge_adapters.icl_nuim.reader import IclNuimReader
@@ -234,6 +235,17 @@ def test_the_number_of_a_frame_is_the_one_that_tells_images_apart(tmp_path: Path
     source = IclNuimReader(camera=SMALL).open(folder)
     assert [frame.frame_id for frame in source.frames] == [0, 1, 2] and not source.doubts
     assert all(frame.read_colour is not None for frame in source.frames)
+
+
+def test_grey_images_are_images(tmp_path: Path) -> None:
+    for number in range(2):
+        write_depth(tmp_path / f"depth/{number}.png", depth_values(number))
+        (tmp_path / "mono").mkdir(exist_ok=True)
+        Image.fromarray(np.full((6, 8), 40 + number, np.uint8)).save(tmp_path / f"mono/{number}.png")
+    assert IclNuimReader().sniff(tmp_path).confidence > 0.5
+    (first, second) = IclNuimReader(camera=SMALL).open(tmp_path).frames
+    assert first.read_colour is not None and second.read_colour is not None
+    assert np.unique(first.read_colour()) == 40 and np.unique(second.read_colour()) == 41
 
 
 def test_images_named_without_numbers_or_by_stamps_are_told_what_to_do(tmp_path: Path) -> None:

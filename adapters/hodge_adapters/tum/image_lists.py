@@ -22,7 +22,7 @@ from hodge_pipeline.types.text import counted
 ASSOCIATION_FILES = ("associations.txt", "association.txt", "associate.txt", "associated.txt")
 LONGEST_DELAY_S = 0.1
 """Between the images of one frame: stamps further apart are not of one clock."""
-COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images")
+COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images", "mono", "gray", "grey")
 _STAMP_NAME = re.compile(r"(\d+\.\d+|[1-9]\d{11,17}|[1-4]\d{18})\.(png|jpg|jpeg)", re.IGNORECASE)
 """Seconds with a fraction, or milliseconds to nanoseconds since 1970: no sequence has so many frames."""
 _DEPTH_NAME = re.compile(r"depth", re.IGNORECASE)
