@@ -57,7 +57,9 @@ def test_depth_on_colour_is_no_doubt(scale: float, right: float) -> None:
 def test_depth_beside_colour_is_told(scale: float, right: float) -> None:
     (note,) = doubts(scale, right)
     assert note.kind == "colour beside depth"
-    assert note.detail == f"scaled by {scale:.2f} and shifted by {right:.0f} and 0 pixels"
+    placed, camera = note.detail.split(" than as it is, ")
+    assert placed == f"scaled by {scale:.2f} and shifted by {right:.0f} and 0 pixels"
+    assert camera == "of a camera of focal length 260 pixels (source.reader.camera)"
     assert doubts(scale, right, count=4) == ()
 
 

@@ -82,6 +82,18 @@ def test_what_lies_too_near_or_too_far_is_asked_about() -> None:
     assert doubts_of(np.zeros(10, np.float32)) == ()
 
 
+@pytest.mark.parametrize(
+    ("step", "width_px", "kind"),
+    [(1.63e-3, 640, "depth unit"), (1.01e-3, 640, "depth range"), (1.63e-3, 320, "depth range")],
+)
+def test_nearer_than_a_camera_of_such_steps_sees_is_another_unit(step: float, width_px: int, kind: str) -> None:
+    """A RealSense's millimetres read at 5000 per metre; steps as fine as a close-up camera's may be of one."""
+    near = in_steps(step) / np.float32(5)
+    assert np.median(near) < 0.25
+    (note,) = doubts_of(near, width_px)
+    assert note.kind == kind and ("depth_scale=1000" in note.detail) == (kind == "depth unit")
+
+
 def test_images_that_cannot_be_read_are_passed_over() -> None:
     def unreadable() -> Floats32:
         raise OSError("gone")

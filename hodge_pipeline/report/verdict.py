@@ -39,6 +39,7 @@ REFINEMENTS: dict[str, Outcome] = {
 LEADS = {
     "images missing": "{count} of {detail} are missing",
     "colour unpaired": "{count} of {detail} depth images have no colour image of their time or number",
+    "colour paired anew": "colour is that of {detail}, which lies on depth",
     "other scale": "in another scale than the truth",
     "truth convention": "the truth seems to be in another convention",
     "truth clock": "{detail}",

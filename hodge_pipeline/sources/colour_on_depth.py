@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.sources.colour_moment import late_doubts
+from hodge_pipeline.sources.colour_moment import late_doubts, paired_anew
 from hodge_pipeline.sources.depth_units import SAMPLED_FRAMES, doubts_of
-from hodge_pipeline.types import Bytes, Floats, Floats32, Frame, Source
+from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame, Source
 from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.image_edges import FEWEST_EDGES, change_along_rows, depth_edges
 from hodge_pipeline.types.notes import Note
@@ -46,35 +46,53 @@ class Agreement:
 def image_doubts(frames: Sequence[Frame]) -> tuple[Note, ...]:
     """Notes on depth that seems not to be in metres, or not to lie on colour, by a few frames, evenly spread.
 
-    An image that cannot be read is left to whoever reads it next.
+    An image that cannot be read is left to whoever reads it next. Colour of another moment lies beside depth too, of a
+    camera that moves steadily: it is the moment where pairs made anew leave no doubt.
     """
     with_depth = [frame for frame in frames if frame.read_depth is not None]
+    values, found = _sampled(with_depth)
+    width_px = max((depth_m.shape[1] for depth_m in values), default=0)
+    units = doubts_of(np.concatenate([depth_m.ravel() for depth_m in values]), width_px) if values else ()
+    camera = with_depth[0].camera if with_depth else None
+    beside, late = colour_doubts(found, camera), late_doubts(with_depth)
+    if beside and late and late[0].kind == "colour paired anew":
+        beside = colour_doubts(_sampled(paired_anew(with_depth, late[0].count))[1])
+    return (*units, *(beside or late))
+
+
+def _sampled(frames: Sequence[Frame]) -> tuple[list[Floats32], list[Agreement]]:
+    """Depth of a few frames, evenly spread, and how their colour agrees with it."""
     values, found = list[Floats32](), list[Agreement]()
-    for row in evenly(len(with_depth), SAMPLED_FRAMES):
+    for row in evenly(len(frames), SAMPLED_FRAMES):
         try:
-            read_depth, read_colour = with_depth[row].read_depth, with_depth[row].read_colour
+            read_depth, read_colour = frames[row].read_depth, frames[row].read_colour
             assert read_depth is not None
             values.append(read_depth())
             found += agreement(values[-1], read_colour()) if read_colour is not None else []
         except (SourceError, OSError):
             continue
-    units = doubts_of(np.concatenate([depth_m.ravel() for depth_m in values])) if values else ()
-    return (*units, *(colour_doubts(found) or late_doubts(with_depth)))
+    return values, found
 
 
 def usable_colour(source: Source, doubts: Sequence[Note]) -> Source:
-    """The source, its frames without colour where that is doubted to lie on depth, or to be of its moment.
+    """The source, its colour paired anew where it is surely of another moment than depth; without colour where that is
+    doubted to lie on depth or to be of its moment.
 
     Landmarks then have the depth of other things, and place frames worse than surfaces alone. The images are still
     shown as they are stored.
     """
-    if not any(doubt.kind in ("colour beside depth", "colour of another moment") for doubt in doubts):
+    told = {doubt.kind: doubt.count for doubt in doubts}
+    if "colour paired anew" in told:
+        return replace(source, frames=paired_anew(source.frames, told["colour paired anew"]))
+    if not told.keys() & {"colour beside depth", "colour of another moment"}:
         return source
     return replace(source, frames=[replace(frame, read_colour=None) for frame in source.frames])
 
 
-def colour_doubts(found: Sequence[Agreement]) -> tuple[Note, ...]:
-    """A note where edges of colour surely agree better with depth scaled or shifted; none of too few frames."""
+def colour_doubts(found: Sequence[Agreement], camera: Camera | None = None) -> tuple[Note, ...]:
+    """A note where edges of colour surely agree better with depth scaled or shifted; none of too few frames. It says of
+    which `camera` depth is taken to be.
+    """
     if len(found) < FEWEST_FRAMES:
         return ()
     every = np.array([each.values for each in found])
@@ -87,6 +105,8 @@ def colour_doubts(found: Sequence[Agreement]) -> tuple[Note, ...]:
     scale, down, right = np.unravel_index(int(mean.argmax()), mean.shape)
     shift_px = [(at - FARTHEST) * found[0].cell_px for at in (right, down)]
     told = f"scaled by {SCALES[scale]:.2f} and shifted by {shift_px[0]} and {shift_px[1]} pixels"
+    if camera is not None:
+        told += f" than as it is, of a camera of focal length {camera.fx:.4g} pixels (source.reader.camera)"
     return (Note("colour beside depth", detail=told),)
 
 

@@ -24,6 +24,9 @@ WRONG_UNITS, SAME, ALIKE = (0.2, 5.0, 8.0, 10.0), 0.03, 1.45
 """Factors on depth of known wrong units: millimetres read as TUM's, the reverse, OpenNI's shifted by three bits, tenths
 of a millimetre. Steps of one kind of sensor differ by less than `SAME`; a step off by more than a factor `ALIKE` is
 that of another sensor."""
+NEAR_STEP, NEAR_WIDTH_PX = 5.2e-3, 640
+"""Step of 1/z, in 1/m, in images of this width: of the RealSense D405, 1/32 of a pixel over 340 px times 18 mm.
+Cameras of coarser steps (longer ranges, or fewer parts of a pixel) see nothing nearer than `PLAUSIBLE_DEPTH_M`."""
 SEEN_M = 4.0
 """Metres: a Kinect hardly sees a larger median depth, so that finer steps then rather mean a wrong unit."""
 FEWEST_PIXELS, FEWEST_VALUES, ROUNDINGS = 5, 20, 5
@@ -32,8 +35,8 @@ WHOLE, MOSTLY = 0.15, 0.9
 """Distance of a step from a whole multiple of the base step, at most, and the share of steps that must keep it."""
 
 
-def doubts_of(depth_m: NDArray[np.floating[Any]]) -> tuple[Note, ...]:
-    """Notes on depths of many pixels, 0 where there is none, that seem not to be in metres."""
+def doubts_of(depth_m: NDArray[np.floating[Any]], width_px: int = NEAR_WIDTH_PX) -> tuple[Note, ...]:
+    """Notes on depths of many pixels of images so wide, 0 where there is none, that seem not to be in metres."""
     valid = depth_m[depth_m > 0]
     if not len(valid):
         return ()
@@ -42,6 +45,8 @@ def doubts_of(depth_m: NDArray[np.floating[Any]]) -> tuple[Note, ...]:
     by_steps = None if step is None else _by_steps(step, median)
     if by_steps is not None:
         return (by_steps,)
+    if median < PLAUSIBLE_DEPTH_M[0] and step is not None and step > NEAR_STEP * NEAR_WIDTH_PX / width_px:
+        return (Note("depth unit", detail=_too_near(step, median)),)
     if not PLAUSIBLE_DEPTH_M[0] < median < PLAUSIBLE_DEPTH_M[1]:
         return (Note("depth range", detail=f"the median depth is {median:.3g} m"),)
     if most < NEAR_M:
@@ -68,6 +73,13 @@ def inverse_step(depth_m: NDArray[np.floating[Any]]) -> float | None:
     base = float(np.median(steps[steps <= 1.5 * np.quantile(steps, 0.2)]))
     multiples = steps / base
     return base if (np.abs(multiples - np.round(multiples)) < WHOLE).mean() > MOSTLY else None
+
+
+def _too_near(step: float, median_m: float) -> str:
+    return (
+        f"no camera whose steps are {1000 * step:.2g} mm at 1 m sees as near as {median_m:.2g} m, the median; stored "
+        f"in millimetres (source.reader.depth_scale=1000) and read at TUM's 5000, it would be {5 * median_m:.2g} m"
+    )
 
 
 def _by_steps(step: float, median_m: float) -> Note | None:

@@ -215,7 +215,9 @@ def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]
     valid = values[values > 0]
     median = float(np.median(valid)) if len(valid) else None
     if with_depth and with_depth[0].read_depth is not None:
-        oddities.extend(str(doubt) for doubt in (*doubts_of(valid), *colour_doubts(edges)))
+        camera, widths = with_depth[0].camera, [frame.camera.width for frame in with_depth if frame.camera is not None]
+        units = doubts_of(valid, max(widths)) if widths else doubts_of(valid)
+        oddities.extend(str(doubt) for doubt in (*units, *colour_doubts(edges, camera)))
     elif median is not None and not PLAUSIBLE_DEPTH_M[0] < median < PLAUSIBLE_DEPTH_M[1]:
         oddities.append(f"the median distance is {median:.3g} m: are the points in metres?")
     return {

@@ -32,6 +32,8 @@ INPUTS = {
     "colour beside depth": "Depth seems not to be registered to colour: edges of both agree better with depth "
     "{detail}. Surfaces alone place frames. Record depth registered (aligned) to colour, or give the images of one "
     "camera and one moment.",
+    "colour paired anew": "Colour was of another moment than depth: each depth image is paired anew with the colour of "
+    "{detail}, which lies on it. Mend the stamps or the pairs of images.",
     "colour of another moment": "Colour seems to be of another moment than depth: that of {detail} lies on it better. "
     "Surfaces alone place frames. Mend the stamps or the pairs of images.",
     "focal length": "The camera's intrinsics are probably wrong: what frames saw of each other fits a focal length of "
