@@ -79,7 +79,7 @@ class KeyFrames:
     frames the start could place: the others lie between their neighbours by `stamps_s (N,)` in each `sequence (N,)`.
     `key_of_frame (N,)` is the key frame, counted among the K, that each frame belongs to; the rows `apart (A,)` are of
     frames with black images that move with it alone, since clouds placed them, but flow the next key frame; `readout_s`
-    is the estimated read-out time of cameras that do not say theirs, 0 where there is no estimate.
+    is the estimated read-out time, None where cameras keep their own.
     """
 
     rows: Ints
@@ -91,7 +91,7 @@ class KeyFrames:
     stamps_s: Floats
     sequence: Ints
     key_of_frame: Ints
-    readout_s: float = 0.0
+    readout_s: float | None = None
     apart: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @classmethod

@@ -10,7 +10,7 @@ from hodge_adapters.tum.reader import READOUT_S, TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.registration.flow import Corners, FlowImage, find_corners, flow_image, follow
-from hodge_pipeline.registration.readout import estimate_readout
+from hodge_pipeline.registration.readout import estimate_readout, with_readout
 from hodge_pipeline.registration.reposing import PosedBlock, repose
 from hodge_pipeline.registration.resection import back_project, project, resect
 from hodge_pipeline.registration.shutter import at_frame_stamp, velocities
@@ -243,9 +243,18 @@ def test_the_read_out_is_estimated_where_nobody_gives_it(tmp_path: Path) -> None
     found = estimate_readout(tmp_path, frames_of(CAMERA), poses, twists, 1.0)
     assert found is not None and found.low_s < found.best_s < found.high_s
     assert found.best_s == pytest.approx(0.0225, abs=0.002)
-    assert estimate_readout(tmp_path, frames_of(ROLLING), poses, twists, 1.0) is None
     assert estimate_readout(tmp_path, frames_of(None), poses, twists, 1.0) is None
     assert estimate_readout(tmp_path, frames_of(CAMERA), poses, np.zeros_like(twists), 1.0) is None
+
+
+@pytest.mark.parametrize(("real_s", "taken_s"), [(ROLLING.readout_s, None), (0.0, 0.0), (-ROLLING.readout_s, -0.0225)])
+def test_a_camera_s_own_read_out_stands_unless_another_surely_fits_better(
+    tmp_path: Path, real_s: float, taken_s: float | None
+) -> None:
+    poses, twists = shaken_views(tmp_path, real_s)
+    found = estimate_readout(tmp_path, frames_of(ROLLING), poses, twists, 1.0)
+    assert (found and found.best_s) == taken_s
+    assert with_readout(ROLLING, taken_s).readout_s == real_s
 
 
 @pytest.mark.parametrize(("readout_s", "speed"), [(0.0, 1.0), (0.06, 1.0), (0.0225, 0.01)])

@@ -387,7 +387,7 @@ def test_an_estimated_read_out_is_told_and_used_by_the_frames(
     monkeypatch.setattr(tracked, "estimate_focal", focal)
     found, notes = track(source, tmp_path / "found", Readout(0.022, 0.02, 0.0239))
     assert used == [0.022] and any("610 pixels (600 to 620) better than its 525" in note for note in notes)
-    assert none.readout_s == 0.0 and followers(source, found).readout_s == 0.022
+    assert none.readout_s is None and followers(source, found).readout_s == 0.022
     assert any("estimated: 22 ms (20 to 24)" in note for note in notes)
     step, poses = Step(tmp_path, no_progress, lambda *_: None), all_poses(source, none, none.world_from_key)
     posed = [

@@ -42,7 +42,12 @@ class Focal:
 
 
 def estimate_focal(
-    sightings: Path, frames: Sequence[Frame], world_from_cam: Floats, twists: Floats, readout_s: float, unit_m: float
+    sightings: Path,
+    frames: Sequence[Frame],
+    world_from_cam: Floats,
+    twists: Floats,
+    readout_s: float | None,
+    unit_m: float,
 ) -> Focal | None:
     """The focal length of least reprojection error in views (a folder of `Sightings`), their poses estimated with it.
 

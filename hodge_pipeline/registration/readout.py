@@ -44,9 +44,9 @@ def drawn_keys(count: int) -> Ints:
     return np.random.default_rng(0).integers(0, count, (DRAWS, count))
 
 
-def with_readout(camera: Camera, readout_s: float) -> Camera:
-    """The camera with its own read-out time where that is known, else with this one."""
-    return camera if camera.readout_s else replace(camera, readout_s=readout_s)
+def with_readout(camera: Camera, readout_s: float | None) -> Camera:
+    """The camera with this read-out time; with its own one where that is None."""
+    return camera if readout_s is None else replace(camera, readout_s=readout_s)
 
 
 def estimate_readout(
@@ -54,31 +54,35 @@ def estimate_readout(
 ) -> Readout | None:
     """The read-out time of least reprojection error in views (a folder of `Sightings`), their poses estimated with it.
 
-    `twists (N, 6)`: see `shutter.velocities`. None where the read-out is known or cameras differ, and where the minimum
-    is not clear: near either end of the times tried, with too wide an interval, or with too few key frames.
+    `twists (N, 6)`: see `shutter.velocities`. None where cameras differ, and where the minimum is not clear: near
+    either end of the times tried, with too wide an interval, or with too few key frames. A camera's own read-out stands
+    (None), unless none at all or its reverse surely fits better, as of images that were turned or are played backwards.
     """
     cameras = {frame.camera for frame in frames}
     camera = next(iter(cameras))
     moves = np.asarray(twists.any(axis=1))
-    if len(cameras) > 1 or camera is None or camera.readout_s or not moves.any():
+    if len(cameras) > 1 or camera is None or not moves.any():
         return None
+    own_s = camera.readout_s
+    tried_s = own_s * np.array([1.0, 0.0, -1.0]) if own_s else TRIED_S
     moving = [view for view in views(sightings) if moves[view.key] and moves[view.row]]
     keys, costs = list[int](), list[Floats]()
     for view in (moving[at] for at in evenly(len(moving), MOST_VIEWS)):
         start = se3.inverse(world_from_cam[view.key]) @ world_from_cam[view.row]
-        cost = _costs(view, camera, frames, twists, start, unit_m)
+        cost = _costs(view, camera, tried_s, frames, twists, start, unit_m)
         if cost is not None:
             keys.append(view.key)
             costs.append(cost)
-    return _minimum(np.array([np.sum([costs[own] for own in rows], axis=0) for _, rows in groups(np.array(keys))]))
+    of_key = np.array([np.sum([costs[own] for own in rows], axis=0) for _, rows in groups(np.array(keys))])
+    return _in_place_of_first(of_key, tried_s) if own_s else _minimum(of_key)
 
 
 def _costs(
-    view: View, camera: Camera, frames: Sequence[Frame], twists: Floats, start: Floats, unit_m: float
+    view: View, camera: Camera, tried_s: Floats, frames: Sequence[Frame], twists: Floats, start: Floats, unit_m: float
 ) -> Floats | None:
     """Robust cost (T,) of a view at each time tried."""
     costs = []
-    for readout_s in TRIED_S.tolist():
+    for readout_s in tried_s.tolist():
         tried = replace(camera, readout_s=readout_s)
         points, seen = view_at_stamps(view, tried, frames, twists, start)
         found = resect(points, seen, tried, start, unit_m)
@@ -97,6 +101,16 @@ def _minimum(costs: Floats) -> Readout | None:
     best = _vertex(costs.sum(axis=0))
     clear = low >= SHORTEST_S and high <= LONGEST_S and high - low <= WIDEST * best
     return Readout(best, low, high) if clear else None
+
+
+def _in_place_of_first(costs: Floats, tried_s: Floats) -> Readout | None:
+    """The time of least total cost (K, T) where that is surely less than at the first one."""
+    best = int(costs.sum(axis=0).argmin())
+    if len(costs) < FEWEST_KEYS or best == 0:
+        return None
+    more = costs[:, best] - costs[:, 0]
+    surely = np.quantile(more[drawn_keys(len(costs))].sum(axis=1), INTERVAL[1]) < 0
+    return Readout(*[float(tried_s[best])] * 3) if surely else None
 
 
 def _vertex(costs: Floats) -> float:

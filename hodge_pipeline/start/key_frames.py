@@ -71,7 +71,7 @@ class Tracked:
     steps: Edges
     sightings: Path
     apart: Ints
-    readout_s: float = 0.0
+    readout_s: float | None = None
 
 
 @dataclass(frozen=True, config=OPTIONS)
@@ -208,14 +208,21 @@ def track(source: Source, options: TrackingOptions, *, workers: Workers, step: S
 
 def _camera_estimates(
     source: Source, sightings: Path, world_from_cam: Floats, twists: Floats, unit_m: float
-) -> tuple[float, tuple[Note, ...]]:
-    """The read-out time in seconds, 0 without an estimate, and notes on it and on a focal length that does not fit."""
-    notes, readout_s = list[Note](), 0.0
+) -> tuple[float | None, tuple[Note, ...]]:
+    """The read-out time in seconds, None without an estimate, and notes on it and on a focal length that does not
+    fit.
+    """
+    notes, readout_s = list[Note](), None
     readout = estimate_readout(sightings, source.frames, world_from_cam, twists, unit_m)
     if readout is not None:
         readout_s = readout.best_s
         best, low, high = (f"{1e3 * time_s:.0f}" for time_s in (readout.best_s, readout.low_s, readout.high_s))
-        notes.append(Note("readout", detail=f"{best} ms ({low} to {high})"))
+        own = {frame.camera.readout_s for frame in source.frames if frame.camera is not None}
+        other, estimated = (
+            Note("other readout", detail=f"{best} ms"),
+            Note("readout", detail=f"{best} ms ({low} to {high})"),
+        )
+        notes.append(other if any(own) else estimated)
     focal = estimate_focal(sightings, source.frames, world_from_cam, twists, readout_s, unit_m)
     if focal is not None and focal.is_other:
         detail = f"{focal.best:.0f} pixels ({focal.low:.0f} to {focal.high:.0f}) better than its {focal.own:.0f}"

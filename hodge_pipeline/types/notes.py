@@ -99,6 +99,8 @@ LOOKS = {
     "moving objects": "much of {count} {count:frame|frames} moved otherwise than the camera ({detail}): people or "
     "objects that move? The camera's motion is the one that fits more of the image; key frames leave out what moves",
     "no clock": "stamps follow each other in {detail} ms, as no camera's images do: frames are taken as evenly spaced",
+    "other readout": "the read-out (rolling shutter) is taken as {detail}, not as the camera's own, with which "
+    "landmarks fit worse: are the images turned, or played backwards?",
     "clock": "the clock goes back at {detail}: the step there counts as long as the usual one",
     "holes": "the recording stops for {detail}: what the frames on both sides share tells the motion there",
     "path broken": "tracking was lost for good in {count} {count:place|places}: the path is in {detail} pieces",
