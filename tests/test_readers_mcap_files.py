@@ -105,8 +105,8 @@ def test_what_is_no_recording(tmp_path: Path, files: dict[str, bytes], remedy: s
 
 def test_packets_of_a_scanner_name_what_to_record(tmp_path: Path) -> None:
     log = Log()
-    log.add_bytes("/livox/lidar", "livox_ros_driver2/msg/CustomMsg", CDR, b"\0\1\0\0\5\0\0\0text\0")
-    with pytest.raises(SourceError, match=r"/livox/lidar \(livox_ros_driver2/msg/CustomMsg\): .* xfer_format 0"):
+    log.add_bytes("/packets", "velodyne_msgs/msg/VelodyneScan", CDR, b"\0\1\0\0\5\0\0\0text\0")
+    with pytest.raises(SourceError, match=r"/packets \(velodyne_msgs/msg/VelodyneScan\): .* PointCloud2$"):
         McapReader().open(log.write(tmp_path / "log.mcap"))
 
 

@@ -1,4 +1,4 @@
-"""Point clouds in messages: ROS 2 PointCloud2 and Foxglove PointCloud, by the fields that they describe."""
+"""Point clouds in messages: PointCloud2 and Foxglove's PointCloud by the fields they describe, Livox's CustomMsg."""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ MAX_POINTS = 1 << 26
 
 _ROS_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _FOXGLOVE_TYPES = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "f4", 8: "f8"}
+_LIVOX_POINT = (("offset_time", "u4", 0), ("x", "f4", 4), ("y", "f4", 8), ("z", "f4", 12))
+_LIVOX_STEPS = (19, 20)
+"""Bytes from one point to the next: of ROS 1, and of CDR, which begins each at a multiple of 4."""
 _READ_FIELDS = (
     "x", "y", "z", "normal_x", "normal_y", "normal_z", "rgb", "rgba", "red", "green", "blue"
 )  # fmt: skip
@@ -58,6 +61,18 @@ def foxglove_layout(message: Message, length: int) -> CloudLayout:
     ]
     width = length // step if step > 0 else 0
     return _checked(width, 1, step, width * step, fields, length, _pose(message))
+
+
+def livox_layout(message: Message, length: int, contents: bytes) -> CloudLayout:
+    """The layout of a CustomMsg, of which `data` is its field `points`; raises `Malformed` where it has none."""
+    points = message.get("points")
+    if not isinstance(points, slice) or points.step not in _LIVOX_STEPS:
+        raise Malformed("no points as Livox's drivers write them")
+    step = int(points.step)
+    count = -(-length // step)  # CDR leaves out what would follow the last point
+    order = ">" if step == _LIVOX_STEPS[1] and not contents[1] & 1 else "<"
+    fields = [(name, order + kind, offset) for name, kind, offset in _LIVOX_POINT]
+    return _checked(count, 1, step, count * step, fields, count * step, None)
 
 
 def read_points(payload: Payload, layout: CloudLayout) -> PointCloud:
@@ -123,10 +138,10 @@ def _pose(message: Message) -> Floats | None:
 
 def _columns(payload: Payload, layout: CloudLayout, contents: bytes) -> NDArray[np.void]:
     names, kinds, offsets = zip(*layout.fields, strict=True)
-    dtype = np.dtype({"names": names, "formats": kinds, "offsets": offsets, "itemsize": layout.point_step})
+    dtype = np.dtype({"names": names, "formats": kinds, "offsets": offsets})
     shape, strides = (layout.height, layout.width), (layout.row_step, layout.point_step)
     if not layout.width * layout.height:
         return np.zeros(0, dtype)
-    if len(contents) < layout.row_step * (layout.height - 1) + layout.width * layout.point_step:
+    if len(contents) < layout.row_step * (layout.height - 1) + (layout.width - 1) * layout.point_step + dtype.itemsize:
         raise payload.error("a cloud with fewer bytes than its size needs")
     return np.asarray(np.ndarray(shape, dtype, contents, 0, strides).reshape(-1))

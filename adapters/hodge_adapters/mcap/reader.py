@@ -38,8 +38,8 @@ from hodge_pipeline.types.text import counted
 
 Layout = TypeVar("Layout")
 
-RAW_SCANS = frozenset({"CustomMsg", "VelodyneScan", "PacketMsg", "PandarScan", "RslidarPacket"})
-"""Messages of Livox's, Velodyne's, Ouster's, Hesai's and RoboSense's drivers that hold no PointCloud2."""
+RAW_SCANS = frozenset({"VelodyneScan", "PacketMsg", "PandarScan", "RslidarPacket"})
+"""Messages of Velodyne's, Ouster's, Hesai's and RoboSense's drivers that hold no PointCloud2."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -275,7 +275,7 @@ def _nothing(path: Path, recording: Recording) -> SourceError:
     why = "".join(f"; {note}" for note in recording.complaints.notes())
     remedy = "record depth images, point clouds or odometry"
     if any(name.rpartition("/")[2] in RAW_SCANS for name in recording.topics.values()):
-        remedy = "these are a scanner's own packets: record its driver's PointCloud2 (Livox's with xfer_format 0)"
+        remedy = "these are a scanner's own packets: record its driver's PointCloud2"
     if not recording.topics:
         return SourceError(f"{path}: holds no message{why}: {remedy}")
     return SourceError(f"{path}: no depth, clouds, images or poses in {_topics(recording)}{why}: {remedy}")

@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from mcap.records import Channel, Schema
 
-from hodge_adapters.mcap.clouds import CloudLayout, foxglove_layout, ros_layout
+from hodge_adapters.mcap.clouds import CloudLayout, foxglove_layout, livox_layout, ros_layout
 from hodge_adapters.mcap.fields import (
     Decoder,
     Message,
@@ -190,6 +190,10 @@ def _adds(
     return add
 
 
+def _add_livox(recording: Recording, message: Message, path: Path, logged: Logged) -> None:
+    _LIVOX_CLOUD(recording, message | {"data": message.get("points")}, path, logged)
+
+
 def _add_calibration(recording: Recording, message: Message, path: Path, logged: Logged) -> None:
     topic = logged.channel.topic
     k, p, distortion = numbers(message, "k", "K"), numbers(message, "p", "P"), numbers(message, "d", "D")
@@ -255,6 +259,7 @@ def _clouds(recording: Recording) -> dict[str, list[Seen[CloudLayout]]]:
 
 
 _RAW_IMAGE = _adds(_images, lambda message, length, _: raw_layout(message, length))
+_LIVOX_CLOUD = _adds(_clouds, livox_layout)
 _CODED_IMAGE = _adds(_images, lambda message, _, contents: compressed_layout(message, contents))
 _KINDS: dict[tuple[str, str], Add] = {
     ("sensor", "Image"): _RAW_IMAGE,
@@ -263,6 +268,9 @@ _KINDS: dict[tuple[str, str], Add] = {
     ("foxglove", "CompressedImage"): _CODED_IMAGE,
     ("sensor", "PointCloud2"): _adds(_clouds, lambda message, length, _: ros_layout(message, length)),
     ("foxglove", "PointCloud"): _adds(_clouds, lambda message, length, _: foxglove_layout(message, length)),
+    ("livox_ros_driver", "CustomMsg"): _add_livox,
+    ("livox_ros_driver2", "CustomMsg"): _add_livox,
+    ("livox_interfaces", "CustomMsg"): _add_livox,
     ("sensor", "CameraInfo"): _add_calibration,
     ("foxglove", "CameraCalibration"): _add_calibration,
     ("sensor", "NavSatFix"): _add_fix,

@@ -1,7 +1,8 @@
 """ROS messages: the text of a `.msg` definition and of all it uses, and the bytes, CDR or ROS 1, that it describes.
 
-Byte arrays are not copied: they are given as a `slice` of the message, so that an image can be read again without its
-schema.
+Arrays of bytes and of structures of numbers, such as points, are not copied: they are given as a `slice` of the
+message, with the bytes from one structure to the next as its step, so that an image or a cloud can be read again
+without its schema.
 """
 
 from __future__ import annotations
@@ -133,7 +134,26 @@ def _read_field(cursor: Cursor, definitions: dict[str, list[Field]], field: Fiel
         return _read_array(cursor, code, count)
     if count > len(cursor.data) - cursor.at:
         raise Malformed("a message that is shorter than its fields say")
+    if plain := _structures(cursor, definitions.get(field.type, []), count):
+        return plain
     return [_read_one(cursor, definitions, field.type, depth) for _ in range(count)]
+
+
+def _structures(cursor: Cursor, fields: list[Field], count: int) -> slice | None:
+    """Go over structures of numbers alone; None where they hold anything else, or begin with a number that is not their
+    largest, so that they have no fixed step.
+    """
+    codes = [_FORMATS.get(field.type, "") if field.count is None else "" for field in fields]
+    sizes = [struct.calcsize(f"={code}") if code else 0 for code in codes]
+    if not count or not sizes or not all(sizes) or max(sizes) > sizes[0]:
+        return None
+    size = 0
+    for each in sizes:
+        size += -size % min(each, cursor.max_alignment) + each
+    step = size + -size % min(sizes[0], cursor.max_alignment)
+    cursor.align(sizes[0])
+    start = cursor.take(step * (count - 1) + size)
+    return slice(start, cursor.at, step)
 
 
 def _read_one(cursor: Cursor, definitions: dict[str, list[Field]], name: str, depth: int) -> Any:

@@ -37,15 +37,30 @@ TYPES = {
     "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
 }
 """Bodies by full name; every type that one uses stands before it or here by its full name."""
+LIVOX = {
+    f"{package}/{name}": text.format(package)
+    for package in ("livox_ros_driver2", "livox_interfaces")
+    for name, text in (
+        (
+            "CustomMsg",
+            _STAMPED + "uint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n{}/CustomPoint[] points\n",
+        ),
+        (
+            "CustomPoint",
+            "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n",
+        ),
+    )
+}
+"""Of Livox's drivers, likewise."""
 _SEPARATOR = "=" * 80 + "\nMSG: "
 
 
 def definition(name: str) -> str:
     """The text of a message type and of all that it uses, as `ros2msg` schemas have it; empty where it is not known."""
-    first = name.replace("/msg/", "/")
-    if first not in TYPES:
+    first, types = name.replace("/msg/", "/"), TYPES | LIVOX
+    if first not in types:
         return ""
     used = [first]
     for one in used:
-        used += [other for other in re.findall(r"^(\w+/\w+)", TYPES[one], re.MULTILINE) if other not in used]
-    return TYPES[first] + "".join(f"{_SEPARATOR}{other}\n{TYPES[other]}" for other in used[1:])
+        used += [other for other in re.findall(r"^(\w+/\w+)", types[one], re.MULTILINE) if other not in used]
+    return types[first] + "".join(f"{_SEPARATOR}{other}\n{types[other]}" for other in used[1:])
