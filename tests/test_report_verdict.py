@@ -158,9 +158,9 @@ def test_a_path_in_doubt_says_so_first(report: Report) -> None:
         replace(report, notes=(Note("focal length", detail="574 pixels (568 to 590) better than its 644"),))
     )
     assert verdict.headline.startswith("In doubt, since images contradict the camera's focal length: improved")
-    doubts = (Note("millimetres", detail="points reach 120,000"), Note("left apart"))
+    doubts = (Note("scan unit", detail="points reach 120,000"), Note("left apart"))
     verdict = judge(replace(report, notes=doubts, wrong_edges=WrongEdges(2, "3–9", 0.12)))
-    reasons = "its unit looks like the millimetre and a guess joins what tracking left apart"
+    reasons = "its unit seems not to be the metre and a guess joins what tracking left apart"
     assert verdict.headline.startswith(f"In doubt, since {reasons} and edges that it uses are judged wrong: improved")
     assert judge(replace(report, wrong_edges=WrongEdges(2, "3–9", 0.0))).headline.startswith("Improved")
 

@@ -43,14 +43,15 @@ def test_the_factor_follows_the_size_of_the_scans(size: float) -> None:
     assert measured_scale(scans(*[size * corner] * 3), VOXEL_M * found) == 1.0
 
 
-@pytest.mark.parametrize(("size", "kinds"), [(1.0, []), (30.0, ["scale"]), (1000.0, ["millimetres"])])
-def test_that_scans_are_large_is_a_fact_and_that_they_may_be_in_millimetres_needs_a_look(
+@pytest.mark.parametrize(("size", "kinds"), [(1.0, []), (30.0, ["scale"]), (1000.0, ["scan unit"])])
+def test_that_scans_are_large_is_a_fact_and_that_they_may_not_be_in_metres_needs_a_look(
     size: float, kinds: list[str]
 ) -> None:
     notes = list[Note]()
     source = Source("scans", Path("scans"), tuple(scans(*[size * furnished_corner(0, 20_000)] * 2)))
     scale_of_scans(source, VOXEL_M, step=cast(Step, SimpleNamespace(note=notes.append)))
     assert [note.kind for note in notes] == kinds
+    assert all(("centimetres: 100" in note.detail) == (note.kind == "scan unit") for note in notes)
 
 
 def test_scans_that_show_no_size_do_not_count() -> None:

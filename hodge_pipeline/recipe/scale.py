@@ -27,7 +27,7 @@ MOST_STEPS = 40
 """Doublings of the voxel: 1e12 times, beyond which the scan is a single place."""
 FULL = 0.5
 """Voxels over points above which smaller voxels show nothing more."""
-MILLIMETRES = 100.0
+NO_METRES = 100.0
 """Factor beyond which the unit is in doubt: no scanner reaches a hundred rooms."""
 POINTS_IN_VOXEL = 3
 """Points to a voxel wanted of a sparse scan: one point in a voxel tells nothing of a surface."""
@@ -46,7 +46,7 @@ def scale_of_scans(source: Source, voxel_m: float, *, step: Step) -> float:
     """Step: the factor on lengths that suits the scans of a source; a note where it is not 1."""
     factor = measured_scale(source.frames, voxel_m)
     if factor != 1.0:
-        step.note(Note("millimetres" if factor > MILLIMETRES else "scale", detail=_in_words(factor, voxel_m)))
+        step.note(Note("scan unit" if factor > NO_METRES else "scale", detail=_in_words(factor, voxel_m)))
     return factor
 
 
@@ -143,5 +143,7 @@ def _in_words(factor: float, voxel_m: float) -> str:
         f"the scans are {size} than a room: all lengths of the recipe are taken times {factor:g} (clouds.voxel_m is "
         f"{voxel_m * factor:.3g} m); scale=1 leaves them as they are"
     )
-    millimetres = "if their unit is the millimetre, set source.reader.units_per_metre=1000; else "
-    return (millimetres if factor > MILLIMETRES else "") + text
+    unit = (
+        "if their unit is not the metre, set source.reader.units_per_metre (millimetres: 1000, centimetres: 100); else "
+    )
+    return (unit if factor > NO_METRES else "") + text

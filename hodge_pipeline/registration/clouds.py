@@ -276,7 +276,11 @@ def _range_advice(ranges: Floats32, option: str, options: CloudOptions) -> str:
     usual = float(np.median(finite))
     limits = f"{options.min_range_m:g} to {options.max_range_m:g} m"
     units = f"source.reader.{option}"
-    unit = f" (millimetres? then {units}=1000)" if usual > 1000 * options.min_range_m else f" (is {units} right?)"
+    unit = (
+        f" (millimetres? then {units}=1000; centimetres: 100)"
+        if usual > 1000 * options.min_range_m
+        else f" (is {units} right?)"
+    )
     return f"its points lie {usual:.3g} m away, in range are {limits}{unit}"
 
 

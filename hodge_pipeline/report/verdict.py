@@ -61,7 +61,7 @@ REASONS = {
     "colour beside depth": "depth seems not to be registered to colour",
     "colour of another moment": "colour seems to be of another moment than depth",
     "focal length": "images contradict the camera's focal length",
-    "millimetres": "its unit looks like the millimetre",
+    "scan unit": "its unit seems not to be the metre",
     "left apart": "a guess joins what tracking left apart",
     "wrong": "edges that it uses are judged wrong",
 }

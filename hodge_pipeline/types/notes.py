@@ -38,7 +38,7 @@ INPUTS = {
     "Surfaces alone place frames. Mend the stamps or the pairs of images.",
     "focal length": "The camera's intrinsics are probably wrong: what frames saw of each other fits a focal length of "
     "{detail} (source.reader.camera, or the file it is read from).",
-    "millimetres": "{detail}",
+    "scan unit": "{detail}",
     "other scale": "The true path is {detail} times as large as this one: depth is read in the wrong unit (--set "
     "source.reader.depth_scale), or with another camera's focal length, or the truth is not in metres, or not of the "
     "camera.",
