@@ -25,7 +25,7 @@ from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.registration import scan_to_map
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.scan_to_map import ScanToMap
-from hodge_pipeline.registration.sweeps import deskewed, deskewed_frame
+from hodge_pipeline.registration.sweeps import deskewed, deskewed_frame, turned
 from hodge_pipeline.sources.frame_facts import frame_facts
 from hodge_pipeline.stages import Step, Steps, no_progress
 from hodge_pipeline.start.sweeps import Sweeps, deskewed_along, follow, key_rows
@@ -34,6 +34,7 @@ from hodge_pipeline.types.notes import Note
 from hodge_pipeline.uses.trajectory import refine_trajectory
 from lidar_worlds import CarFree
 
+Sweeping = Sequence[tuple[int, float, PointCloud]]
 COUNT, SPEED_M_S, UNIX_S = 24, 10.0, 1.7e9
 NEAR_M = 0.1
 """Whole sequences are off by 0.02 m; a sweep followed from a wrong velocity by half a metre and more."""
@@ -46,23 +47,27 @@ def street() -> list[Frame]:
     return frames_of([own.sweep(number) for number in range(COUNT)])
 
 
+def once(what: Callable[..., object]) -> Callable[..., object]:
+    """A function whose answers are kept; the last argument is sweeps."""
+    found = dict[str, bytes]()
+
+    def answer(*given: object) -> object:
+        *others, sweeps = given
+        content = [(row, at, one.points_in_cam, one.times_s) for row, at, one in cast(Sweeping, sweeps)]
+        key = hashlib.sha256(pickle.dumps((others, content))).hexdigest()
+        if key not in found:
+            found[key] = pickle.dumps(what(*given))
+        return pickle.loads(found[key])
+
+    return answer
+
+
 @pytest.fixture(scope="module", autouse=True)
-def first_velocity_once() -> Iterator[None]:
-    """The first velocity of the same sweeps is found once: it is most of what following so few sweeps costs."""
-    found = dict[str, tuple[Floats, frozenset[int]]]()
-
-    def first_velocity(
-        voxel_m: float, sweeps: Sequence[tuple[int, float, PointCloud]]
-    ) -> tuple[Floats, frozenset[int]]:
-        content = [(row, at, one.points_in_cam, one.times_s) for row, at, one in sweeps]
-        given = hashlib.sha256(pickle.dumps((voxel_m, content)))
-        if given.hexdigest() not in found:
-            found[given.hexdigest()] = scan_to_map.first_velocity(voxel_m, sweeps)
-        velocity, strange = found[given.hexdigest()]
-        return velocity.copy(), strange
-
+def warm_up_once() -> Iterator[None]:
+    """What the first of the same sweeps tell is found once: it is most of what following so few sweeps costs."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hodge_pipeline.start.sweeps.first_velocity", first_velocity)
+        for what in (scan_to_map.first_velocity, scan_to_map.is_backwards):
+            patch.setattr(f"hodge_pipeline.start.sweeps.{what.__name__}", once(what))
         yield
 
 
@@ -75,7 +80,7 @@ def frames_of(sweeps: list[object]) -> list[Frame]:
     return [Frame(f"{number}.pcd", float(number), read_points=partial(same, c)) for number, c in enumerate(clouds)]
 
 
-def true_poses(rows: Ints | list[int]) -> Floats:
+def true_poses(rows: Ints | Sequence[int]) -> Floats:
     return Road(SPEED_M_S).world_from_car(np.asarray(rows) * REVOLUTION_S)
 
 
@@ -205,6 +210,14 @@ def test_given_poses_of_sweeps_without_times_are_told_and_those_of_stations_are_
     assert [note.kind for note in notes] == told
 
 
+def test_times_that_run_backwards_are_turned_in_all_sweeps_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    right, _ = followed(street())
+    monkeypatch.setattr("hodge_pipeline.start.sweeps.is_backwards", lambda *_: True)
+    found, said = followed([changed(frame, turned) for frame in street()])
+    assert "seem to run backwards" in said and "24 of 24 sweeps" in said and found.backwards.all()
+    np.testing.assert_allclose(found.world_from_scan, right.world_from_scan, atol=1e-3)
+
+
 def test_every_third_sweep_is_deskewed_by_its_own_speed() -> None:
     found, _ = followed(street()[::3])
     rows = np.arange(0, COUNT, 3)
@@ -267,8 +280,17 @@ class Turning(CarFree):
 def test_a_turn_from_the_first_sweep_on_is_followed() -> None:
     own = SpinningScanner(cast(Road, Turning()), 0, beams=16, columns=360, noise=1.0)
     found, _ = followed(frames_of([own.sweep(number) for number in range(COUNT)]))
+    assert not found.backwards.any()
     exact = Turning().world_from_car(np.arange(COUNT) * REVOLUTION_S)
     assert absolute_error(found.world_from_scan, exact).max_m < NEAR_M
+
+
+def test_times_that_run_backwards_are_told_by_the_points_on_the_map() -> None:
+    scanner = SpinningScanner(Road(15.0), 0, beams=16, columns=360, noise=1.0)
+    right = [PointCloud(sweep.points, times_s=sweep.times_s) for sweep in map(scanner.sweep, range(20))]
+    for clouds, is_turned in ((right, False), ([turned(cloud) for cloud in right], True)):
+        given = [(row, row * REVOLUTION_S, cloud) for row, cloud in enumerate(clouds)]
+        assert scan_to_map.is_backwards(0.5, np.array([0, 0, 0, 15.0, 0, 0]), given) is is_turned
 
 
 def test_names_of_times_are_seconds_in_their_order(tmp_path: Path) -> None:
@@ -320,7 +342,7 @@ def test_key_frames_begin_and_end_with_sweeps_that_were_found() -> None:
     poses[:, 0, 3] = 0.4 * np.arange(12)
     at_hand = np.arange(12) % 7 > 0  # without the first and the seventh
     at_hand[9:] = False
-    found = Sweeps(poses, np.zeros((12, 6)), at_hand, 40.0)
+    found = Sweeps(poses, np.zeros((12, 6)), at_hand, np.zeros(12, bool), 40.0)
     assert key_rows(found, (np.arange(9), np.arange(9, 12)), 1.0, 15.0).tolist() == [1, 4, 8]
 
 

@@ -11,7 +11,7 @@ import small_gicp
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.assessment import MIN_POINTS
-from hodge_pipeline.registration.sweeps import deskewed
+from hodge_pipeline.registration.sweeps import deskewed, turned
 from hodge_pipeline.types import Floats, Floats32, Ints, PointCloud
 
 START_LEVELS, LEVELS = (9, 3, 1), (3, 1)
@@ -53,6 +53,11 @@ simulated corridor steps of 16 beams scattered by 0.1 m and claimed 3 mm.
 """
 MOST_PASSES = 4
 """Passes over the first sweeps, forwards and backwards, for their velocity, at most."""
+SURE, FEWEST_TIMED = 4.0, 10
+"""Standard errors by which more points lie on the map where times run backwards, over as many of the first sweeps and
+more, before they are taken so: of 63 simulated sequences with right times none
+reaches it, of the same turned 28.
+"""
 MOST_DESKEWS, FARTHER = 3, 0.9
 """A sweep is deskewed again while its new velocity moves its farther points, at this quantile, by half a voxel."""
 
@@ -201,6 +206,26 @@ def first_velocity(voxel_m: float, sweeps: Sequence[tuple[int, float, PointCloud
         if len(ends) > 2 and step_m < voxel_m / 2:
             break
     return ends[(len(ends) - 1) // 2 * 2], strange
+
+
+def is_backwards(voxel_m: float, velocity: Floats, sweeps: Sequence[tuple[int, float, PointCloud]]) -> bool:
+    """Whether clearly more points of these first sweeps, which began with this velocity, lie on the map where the times
+    of points are turned: right times put points where they were, wrong ones blur the map.
+    """
+    if len(sweeps) < FEWEST_TIMED or all(cloud.times_s is None for _, _, cloud in sweeps):
+        return False
+    told = _shares(voxel_m, velocity, sweeps)
+    gain = _shares(voxel_m, velocity, [(row, at, turned(cloud)) for row, at, cloud in sweeps]) - told
+    return bool(np.nanmean(gain) > SURE * np.nanstd(gain, ddof=1) / np.sqrt(len(gain)))
+
+
+def _shares(voxel_m: float, velocity: Floats, sweeps: Sequence[tuple[int, float, PointCloud]]) -> Floats:
+    """The share of points on the map of each sweep but the first two, which have no map of sweeps placed yet."""
+    tracker, shares = ScanToMap(voxel_m, velocity), list[float]()
+    for _, time_s, cloud in sweeps:
+        tracker.accept(step := tracker.place(cloud, time_s))
+        shares.append(step.on_map)
+    return np.array(shares[2:])
 
 
 def _usual(shares: deque[float]) -> float:

@@ -36,6 +36,24 @@ def deskewed(cloud: PointCloud, velocity: Floats, after_s: float = 0.0) -> Point
     return replace(cloud, points_in_cam=points, normals_in_cam=None, times_s=None)
 
 
+def turned(cloud: PointCloud) -> PointCloud:
+    """The cloud with the times of its points running the other way."""
+    if cloud.times_s is None or not len(cloud):
+        return cloud
+    return replace(cloud, times_s=cloud.times_s.max() - cloud.times_s)
+
+
+def turned_frame(frame: Frame) -> Frame:
+    """The frame, the times of its points turned whenever they are read."""
+    if frame.read_points is None:
+        return frame
+    return replace(frame, read_points=partial(_read_turned, frame.read_points))
+
+
+def _read_turned(read: Callable[[], PointCloud]) -> PointCloud:
+    return turned(read())
+
+
 def first_after_s(cloud: PointCloud, stamp_s: float) -> float:
     """Seconds from the stamp of a sweep to its first point, negative where the stamp is that of a later one; 0 where
     the points are counted from another moment: then the stamp is taken as that of the first.

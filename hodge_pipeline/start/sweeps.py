@@ -19,8 +19,8 @@ from hodge_pipeline.registration.clouds import CloudOptions, Oddity, in_range, m
 from hodge_pipeline.registration.gaps import told_gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, OdometryOptions, chained
 from hodge_pipeline.registration.pairs import register_pairs
-from hodge_pipeline.registration.scan_to_map import ScanToMap, first_velocity, followed
-from hodge_pipeline.registration.sweeps import deskewed_frame, first_after_s, velocities
+from hodge_pipeline.registration.scan_to_map import ScanToMap, first_velocity, followed, is_backwards
+from hodge_pipeline.registration.sweeps import deskewed_frame, first_after_s, turned_frame, velocities
 from hodge_pipeline.scene import (
     KeyFrames,
     Scene,
@@ -63,12 +63,14 @@ NO_CLOCK_S = 1.0
 class Sweeps:
     """Poses (N, 4, 4) of all sweeps at their stamps, their velocities (N, 6), and which (N,) were read.
 
+    `backwards` (N,) is where the times of points are turned;
     `reach_m` is how far the scanner sees: 99 % of a usual sweep's points are nearer.
     """
 
     world_from_scan: Floats
     velocity: Floats
     found: Bools
+    backwards: Bools
     reach_m: float
 
 
@@ -90,7 +92,11 @@ class SweepsStart(OdometryStart):
         """The key frames of a sequence of sweeps, with deskewed clouds and poses."""
         sequences = tuple(sequences_of(source).values())
         found = steps.step(follow, source, sequences, clouds, self.voxel_m, title="sweeps", total=len(source.frames))
-        frames = tuple(map(deskewed_frame, source.frames, found.velocity))
+        timed = [
+            turned_frame(frame) if is_turned else frame
+            for frame, is_turned in zip(source.frames, found.backwards, strict=True)
+        ]
+        frames = tuple(map(deskewed_frame, timed, found.velocity))
         whole = replace(source, frames=frames)
         steps.remember(whole, steps.key([source, found]) + "deskewed")
         apart_m = found.reach_m / KEY_FRAMES_IN_REACH if self.distance_m is None else self.distance_m
@@ -121,10 +127,11 @@ def follow(
     count, stamps = len(source.frames), stamps_of(source)
     poses, velocity = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6))
     found, loose, parts = np.zeros(count, bool), np.zeros(count, bool), list[_Followed]()
+    backwards = np.zeros(count, bool)
     for rows in sequences:
         part = _follow_one([source.frames[row] for row in rows], stamps[rows], clouds, voxel_m, step.advance)
         poses[rows], velocity[rows] = part.world_from_scan, part.velocity
-        found[rows], loose[rows] = part.found, part.loose
+        found[rows], loose[rows], backwards[rows] = part.found, part.loose, part.backwards
         parts.append(part)
     odd = [one for part in parts for one in part.odd]
     if not found.any():
@@ -138,14 +145,17 @@ def follow(
         step.note(Note(kind, int(loose.sum()), str(count)))
     clocked = [rows for rows in sequences if is_clock(stamps[rows])]
     step.note(*told_gaps(clocked, stamps, vertex_ids(source)))
+    if backwards.any():
+        step.note(Note("times backwards", int(backwards.sum()), str(count)))
     if not any(part.is_timed for part in parts):
         step.note(Note("sweeps untimed"))
-    return Sweeps(poses, velocity, found, min(part.reach_m for part in parts))
+    return Sweeps(poses, velocity, found, backwards, min(part.reach_m for part in parts))
 
 
 class _Followed(NamedTuple):
     """One sequence: poses (M, 4, 4) at the stamps, velocities (M, 6), which (M,) sweeps were read, where (M,) the
-    alignment was loose; whether points have times; the reach of the scanner in metres; what is odd.
+    alignment was loose; whether points have times, and these are turned; the reach of the scanner in metres; what is
+    odd.
     """
 
     world_from_scan: Floats
@@ -153,6 +163,7 @@ class _Followed(NamedTuple):
     found: Bools
     loose: Bools
     is_timed: bool
+    backwards: bool
     reach_m: float
     odd: list[Oddity]
 
@@ -166,8 +177,12 @@ def _follow_one(
     usual_m, usual_turn_s = _first_look(frames, clouds)
     times = _times(stamps_s, usual_turn_s)
     voxel = voxel_m or max(usual_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
-    first = enumerate(_sweeps(frames[:WARM_UP], clouds, usual_m))
-    begun, strange = first_velocity(voxel, [(row, times[row], one.cloud) for row, one in first if one.cloud])
+    warm_up = _timed_sweeps(frames[:WARM_UP], times, clouds, usual_m)
+    begun, strange = first_velocity(voxel, warm_up)
+    backwards = is_backwards(voxel, begun, [one for one in warm_up if one[0] not in strange])
+    if backwards:
+        frames = [turned_frame(frame) for frame in frames]
+        begun, strange = first_velocity(voxel, _timed_sweeps(frames[:WARM_UP], times, clouds, usual_m))
     tracker = ScanToMap(voxel, begun)
 
     def read() -> Iterator[tuple[int, float, PointCloud]]:
@@ -196,7 +211,15 @@ def _follow_one(
         last = np.maximum(np.searchsorted(rows, np.arange(count), side="right") - 1, 0)
         velocity = velocities(poses[rows], times[rows])[last]
         poses = poses[rows][last] @ se3.exp(-middle_s[rows][last][:, None] * velocity)  # to the stamp
-    return _Followed(poses, velocity, found, loose, is_timed, usual_m, odd)
+    return _Followed(poses, velocity, found, loose, is_timed, backwards, usual_m, odd)
+
+
+def _timed_sweeps(
+    frames: list[Frame], times: Floats, clouds: CloudOptions, usual_m: float
+) -> list[tuple[int, float, PointCloud]]:
+    """Row, time of its beginning and points of each sweep that can be read."""
+    every = enumerate(_sweeps(frames, clouds, usual_m))
+    return [(row, times[row], sweep.cloud) for row, sweep in every if sweep.cloud]
 
 
 def deskewed_along(source: Source, world_from_scan: Floats, clouds: CloudOptions, steps: Steps) -> Source:

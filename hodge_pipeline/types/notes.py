@@ -112,6 +112,8 @@ LOOKS = {
     "tunnel, and it goes on as before",
     "sweeps untimed": "the points of the sweeps have no times (t, time, timestamp): each is taken as measured in an "
     "instant, and unless it was deskewed before (KITTI's are), turns bend the path",
+    "times backwards": "the times of points seem to run backwards: taken so, more points lie on the map; they are "
+    "taken so in {count} of {detail} sweeps",
     "misfits": "{count} {count:frame fits|frames fit} nothing that the key frame saw ({detail}), and "
     "{count:follows|follow} its pose",
     "no truth near": "{detail}: no pose has a true one near in time: its error is not measured",
