@@ -44,6 +44,11 @@ class Inferred:
     log_evidence: float
     confirmed: bool
 
+    @property
+    def scales_here(self) -> Scales:
+        """The scales of errors by what the final poses leave."""
+        return self.scales.at_solution(Fit(self.reduced, self.linear))
+
     @cached_property
     def polished(self) -> tuple[Linear, Floats]:
         """The chain at the final poses, and factors (M,) on the loops' standard deviations: see `polished`."""
@@ -56,18 +61,26 @@ def infer(
     """The loops of a chain, judged; those of `trusted (M,)` are used in any case.
 
     `may_thin`: where the right loops leave more than `MOST_UNKNOWNS`, all are judged at the poses of some of them;
-    without it None comes back then. `scales`: of the errors; by default learned from the loops.
+    without it None comes back then. `scales`: of the errors; by default learned from the loops, and anew at the poses
+    that they lead to where the drift of a long path had hidden how loops err: where scales there differ much, other
+    loops agree by them, and the loops are likelier.
     """
-    poses = chain.poses
-    scales, shares = learn_scales(chain, outliers) if scales is None else (scales, EVEN)
-    chain = scales.applied(chain)
-    start = linearise(chain, poses)
-    trial = _Trial(start, judge(start, None, shares, outliers), shares, outliers, trusted, may_thin, scales)
-    try:
-        return trial.inferred()
-    except np.linalg.LinAlgError:  # loops tear paths so far apart that covariances are lost in rounding
-        reduced = thinned(chain, np.flatnonzero(trusted))
-        return Inferred(trusted, trial.alone, scales, start, start, reduced, 0.0, confirmed=False)
+    given, shares = learn_scales(chain, outliers) if scales is None else (scales, EVEN)
+    found = _Trial.of(chain, outliers, trusted, may_thin, given, shares).inferred()
+    for _ in range(MOST_LEARNED if scales is None else 0):
+        if found is None or not found.confirmed:
+            break
+        trial = _Trial.of(chain, outliers, trusted, may_thin, found.scales_here, EVEN)
+        is_other = found.scales.differ_much(trial.scales) and trial.changes(found)
+        other = trial.inferred() if is_other else None
+        if other is None or other.log_evidence <= found.log_evidence:
+            break
+        found = other
+    return found
+
+
+MOST_LEARNED = 3
+"""Times that scales are learned anew: a limit on cost."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +109,35 @@ class _Trial:
     may_thin: bool
     scales: Scales
 
+    @classmethod
+    def of(
+        cls, chain: Chain, outliers: OutlierModel, trusted: Bools, may_thin: bool, scales: Scales, shares: Floats
+    ) -> _Trial:
+        """The trial of a chain whose errors have these scales."""
+        chain = scales.applied(chain)
+        start = linearise(chain, chain.poses)
+        return cls(start, judge(start, None, shares, outliers), shares, outliers, trusted, may_thin, scales)
+
+    def changes(self, found: Inferred) -> bool:
+        """Whether by these scales other loops agree with the poses that the used ones lead to than those."""
+        linear = replace(found.linear, chain=self.start.chain)
+        try:
+            agreed = self.agreed(found.used, self.shares, linear)
+        except np.linalg.LinAlgError:
+            return False
+        return agreed is not None and bool((agreed[0] != found.used).any())
+
     def inferred(self) -> Inferred | None:
         """The loops judged at the poses of the right ones; None where these are too many: see `infer`."""
+        try:
+            return self._inferred()
+        except np.linalg.LinAlgError:  # loops tear paths so far apart that covariances are lost in rounding
+            reduced = thinned(self.start.chain, np.flatnonzero(self.trusted))
+            return Inferred(
+                self.trusted, self.alone, self.scales, self.start, self.start, reduced, 0.0, confirmed=False
+            )
+
+    def _inferred(self) -> Inferred | None:
         grown = self.grown()
         if grown is None:
             return None

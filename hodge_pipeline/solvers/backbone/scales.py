@@ -1,4 +1,4 @@
-"""Scales of stated errors, learned from the closing errors of a chain's loops."""
+"""Scales of stated errors, learned from the closing errors of a chain's loops, and anew from what a solution leaves."""
 
 from __future__ import annotations
 
@@ -7,10 +7,19 @@ from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import chdtri
 
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.credible import MOST_OF_A_STEP
-from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel, OutlierResiduals, mixture, student_log_density
+from hodge_pipeline.solvers.backbone.evidence import (
+    EVEN,
+    OutlierModel,
+    OutlierResiduals,
+    mahalanobis,
+    mixture,
+    student_log_density,
+)
+from hodge_pipeline.solvers.backbone.fit import Fit
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.types import Floats, Ints
@@ -33,6 +42,8 @@ DECOYS = 4
 """Decoys per loop: with one, scales of loops differed up to eightfold from one draw to the next."""
 SURPRISING = 2.5
 """Learned scale of steps that tells something: right loops of 288 walks that err as stated ask for up to 2."""
+FEWEST_LEFT = 10
+"""Loops and runs at a solution of which it tells their scale, to a fifth."""
 MOST_LOOPS = 3000
 """Loops that scales are learned from: more hardly change them."""
 
@@ -80,6 +91,24 @@ class Scales:
     def loops_surprise(self) -> bool:
         """Whether loops err more than what they state by over a standard deviation of the prior."""
         return bool(max(self.loop_turn, self.loop_shift) > np.exp(FOLD))
+
+    def differ_much(self, other: Scales) -> bool:
+        """Whether one of them differs from the other's by over a standard deviation of the prior."""
+        return bool((np.abs(np.log(astuple(self)) - np.log(astuple(other))) > FOLD).any())
+
+    def at_solution(self, fit: Fit) -> Scales:
+        """These scales, by which the fit was made, times how much larger residuals are there than they should be: the
+        median of each kind, of runs of steps or loops, at poses solved without it. The same where these are few.
+        """
+        split, factors = fit.linear.chain.rotation_axes, np.ones(4)
+        for kind, rows in enumerate((fit.reduced.of_runs, fit.reduced.of_loops)):
+            residual, covariance = fit.left_out(rows)
+            for part, axes in enumerate((slice(0, split), slice(split, None))):
+                if len(residual) >= FEWEST_LEFT:
+                    chi2 = mahalanobis(residual[:, axes], covariance[:, axes, axes])[0]
+                    usual = np.median(chi2) / chdtri(residual[:, axes].shape[1], 0.5)
+                    factors[2 * kind + part] = np.sqrt(max(usual, np.finfo(float).tiny))
+        return Scales(*(np.array(astuple(self)) * factors).tolist())
 
     def units(self, chain: Chain) -> tuple[Floats, Floats]:
         """The factor on each free axis (p,), of steps and of loops."""
