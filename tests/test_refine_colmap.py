@@ -197,9 +197,9 @@ def test_an_adjustment_of_points_leaves_poses_and_rigs_bit_for_bit(tmp_path: Pat
 def test_observations_are_held_out_of_a_sample_of_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (model,) = ColmapModels().open_models(noisy(tmp_path))
     step = Step(tmp_path, Mock(), Mock())
-    whole = choice.held_out_errors(model, model, False, 0, step=step).errors_px
+    whole = choice.held_out_errors_px(model, model, False, 0, step=step)
     monkeypatch.setattr(choice, "ENOUGH_SEEN", 20)
-    part = choice.held_out_errors(model, model, False, 0, step=step).errors_px
+    part = choice.held_out_errors_px(model, model, False, 0, step=step)
     most = 20 * model.quality.images * choice.OBSERVATIONS_HELD_OUT
     assert 0 < part.shape[1] < 1.5 * most < whole.shape[1]
     assert np.median(part[0]) == pytest.approx(np.median(whole[0]), rel=0.5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hodge_pipeline.refine.guard import NOISE_SIGMAS, Measure
-from hodge_pipeline.refine.image_steps import MOST_STEPS, step_errors
+from hodge_pipeline.refine.image_steps import MOST_STEPS, step_errors_m
 from hodge_pipeline.rounds.one_round import Work
 from hodge_pipeline.scene import KeyFrames
 from hodge_pipeline.types import Floats, Ints
@@ -35,8 +35,7 @@ def off_images_m(work: Work, firsts: Ints, before: Floats, after: Floats) -> Flo
     if not len(firsts) or not all(frame.read_colour and frame.read_depth for frame in source.frames):
         return np.full((2, len(firsts)), np.nan)
     pairs, poses = np.column_stack([firsts, firsts + 1]), np.stack([before, after])
-    found = work.steps.step(step_errors, source, pairs, poses, scale, title="guard: images", total=len(pairs))
-    return found.off_m
+    return work.steps.step(step_errors_m, source, pairs, poses, scale, title="guard: images", total=len(pairs))
 
 
 def against_images(work: Work, key_frames: KeyFrames, after: Floats) -> list[Measure]:

@@ -175,7 +175,7 @@ def make_candidates(
     found, model, first_robust = _Candidates(inputs, start, steps), start, 0
     poses = None
     if not found.costs[0].is_sound:
-        poses = steps.step(resected_poses, start, None, title="resection").poses
+        poses = steps.step(resected, start, None, title="resection")
         found.add(RESECTED, start, poses, whole_steps=True)
     if not found.is_mended:
         found.add(ADJUSTED, start, row=1)
@@ -229,7 +229,7 @@ def _add_resected(found: _Candidates, steps: Steps) -> None:
         names = np.array([str(frame.frame_id) for frame in model.frames])
         bodies = np.zeros(len(model.body_names), bool)
         bodies[model.body_of_frame[np.isin(names, doubtful)]] = True
-        poses = steps.step(resected_poses, model, bodies, title="resection").poses
+        poses = steps.step(resected, model, bodies, title="resection")
         found.add(MENDED, model, poses)
         if found.best == at:
             return
@@ -247,16 +247,11 @@ def _add_without_robust_loss(found: _Candidates, start: TrackedModel, first_robu
         found.update_costs()
 
 
-@dataclass(frozen=True)
-class BodyPoses:
-    """Poses (B, 4, 4) of a model's bodies."""
-
-    poses: Floats
-
-
-def resected_poses(model: TrackedModel, bodies: Bools | None, *, step: Step) -> BodyPoses:
-    """Step: the poses of the model with these bodies (B,) placed by resection from its points; None: all of them."""
-    return BodyPoses(model.resected(bodies))
+def resected(model: TrackedModel, bodies: Bools | None, *, step: Step) -> Floats:
+    """Step: the poses (B, 4, 4) of the bodies with these (B,) placed by resection from the model's points; None: all of
+    them.
+    """
+    return model.resected(bodies)
 
 
 def measured_edges(model: TrackedModel, *, step: Step) -> tuple[ViewGraph, tuple[str, ...]]:

@@ -172,7 +172,7 @@ def _reason_to_keep(found: CandidateSet, at: int, seed: int, steps: Steps) -> st
     share = moved / extent if extent > 0 else 0.0
     if share > LEAST_MOVE and gain < GAIN_TO_MOVE and not start.moves_calibration:
         return f"the best candidate gains {gain:.1%} of the mean error and moves cameras by {share:.2%} of their extent"
-    errors = steps.step(held_out_errors, start, model, moves, seed, title="observations held out").errors_px
+    errors = steps.step(held_out_errors_px, start, model, moves, seed, title="observations held out")
     if not errors.size and gain < CLEAR_GAIN and model.quality.points == start.quality.points:
         return (
             f"the best candidate gains {gain:.1%} of the mean error, and tracks are too short to hold any of them out"
@@ -185,18 +185,11 @@ def _reason_to_keep(found: CandidateSet, at: int, seed: int, steps: Steps) -> st
     return f"observations held out are {medians[0]:.4g} px off, {medians[1]:.4g} px after the best candidate"
 
 
-@dataclass(frozen=True)
-class HeldOutErrors:
-    """Reprojection errors (2, H) in pixels of the observations held out, of the reference and of the candidate."""
-
-    errors_px: Floats
-
-
-def held_out_errors(start: TrackedModel, model: TrackedModel, moves: bool, seed: int, *, step: Step) -> HeldOutErrors:
-    """Step: errors at random observations that were left out of the adjustment: where the candidate `moves` poses, of
-    the start of its points alone and of the candidate of points and poses; else of the start as it is and of the
-    candidate of its points. Of tracks of which each image sees `ENOUGH_SEEN`. None where merged tracks make the
-    observations incomparable.
+def held_out_errors_px(start: TrackedModel, model: TrackedModel, moves: bool, seed: int, *, step: Step) -> Floats:
+    """Step: errors (2, H) of start and candidate at random observations that were left out of the adjustment: where the
+    candidate `moves` poses, of the start of its points alone and of the candidate of points and poses; else of the
+    start as it is and of the candidate of its points. Of tracks of which each image sees `ENOUGH_SEEN`. None (2, 0)
+    where merged tracks make the observations incomparable.
     """
     adjusted: tuple[Adjusted, Adjusted] = ("points", "all") if moves else ("nothing", "points")
     out = []
@@ -204,9 +197,7 @@ def held_out_errors(start: TrackedModel, model: TrackedModel, moves: bool, seed:
         one = whole.thinned(ENOUGH_SEEN)
         chosen = np.random.default_rng(seed).random(len(one.quality.errors_px)) < OBSERVATIONS_HELD_OUT
         out.append(one.held_out_errors(chosen, what))
-    if len(out[0]) != len(out[1]):
-        return HeldOutErrors(np.zeros((2, 0)))
-    return HeldOutErrors(np.array(out))
+    return np.array(out) if len(out[0]) == len(out[1]) else np.zeros((2, 0))
 
 
 def held_out_score(distances_m: Floats) -> Measure:

@@ -6,8 +6,6 @@ poses. Depth enters by the parallax alone, so depth that is 5 % off makes a step
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from hodge_pipeline import se3
@@ -22,15 +20,9 @@ RANGE_M = (0.1, 100.0)
 """Depth that counts, in units of the recipe's scale."""
 
 
-@dataclass(frozen=True)
-class StepErrors:
-    """`off_m (S, P)`: how far P steps lie from those that images show, under S sets of poses."""
-
-    off_m: Floats
-
-
-def step_errors(source: Source, pairs: Ints, pose_sets: Floats, unit_m: float, *, step: Step) -> StepErrors:
-    """Step: the errors of the steps between pairs (P, 2) of frames under sets of poses (S, K, 4, 4).
+def step_errors_m(source: Source, pairs: Ints, pose_sets: Floats, unit_m: float, *, step: Step) -> Floats:
+    """Step: how far (S, P) steps between pairs (P, 2) of frames, under sets of poses (S, K, 4, 4), lie from those that
+    images show.
 
     NaN where a pair has no readable images, or too few of its corners agree on a motion. `unit_m`: the recipe's scale.
     """
@@ -44,7 +36,7 @@ def step_errors(source: Source, pairs: Ints, pose_sets: Floats, unit_m: float, *
         if found is not None:
             off_m[:, column] = np.linalg.norm((se3.inverse(found.key_from_view) @ i_from_j)[:, :3, 3], axis=1)
         step.advance(1)
-    return StepErrors(off_m)
+    return off_m
 
 
 def _read(frame: Frame, unit_m: float) -> FlowImage | None:
