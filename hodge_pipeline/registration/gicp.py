@@ -13,7 +13,7 @@ from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.assessment import MIN_POINTS, assess, to_registration, unregistered
+from hodge_pipeline.registration.assessment import MIN_POINTS, Assessment, assess, to_registration, unregistered
 from hodge_pipeline.types import Floats, Ints, PointCloud, Registration
 
 ROTATION_EPSILON_RAD = 1e-3
@@ -92,15 +92,8 @@ class _SmallGicp:
             motion, converged = np.asarray(result.T_target_source), bool(result.converged)
             iterations += 1 + int(result.iterations)  # small_gicp counts from 0
         points = source.sample_points(self.source_points[-1])
-        assessment = assess(
-            source_points=points,
-            target_points=target.points,
-            target_normals=target.normals,
-            find_nearest=target.find_nearest,
-            i_from_j=motion,
-            max_distance_m=self.distances_m[-1],
-            points_per_sample=self.points_per_sample * len(points) / len(source),
-        )
+        per_sample = self.points_per_sample * len(points) / len(source)
+        assessment = target.assess(points, motion, self.distances_m[-1], per_sample)
         return to_registration(assessment, motion, iterations, converged)
 
 
@@ -223,6 +216,15 @@ class PreparedCloud:
         """Rows of the nearest points and the squared distances."""
         rows, squared = self.tree.batch_knn_search(queries, 1)
         return np.asarray(rows).reshape(-1).astype(np.int64), np.asarray(squared).reshape(-1)
+
+    def assess(
+        self, source_points: Floats, i_from_j: Floats, max_distance_m: float, points_per_sample: float
+    ) -> Assessment:
+        """What a registration of source points (n, 3) to this cloud is worth, see `assessment.assess`."""
+        return assess(
+            self.find_nearest, self.points, self.normals, source_points, i_from_j,
+            max_distance_m=max_distance_m, points_per_sample=points_per_sample,
+        )  # fmt: skip
 
     def _stride(self, count: int) -> int:
         return max(1, -(-len(self) // count))

@@ -121,16 +121,13 @@ def _run_block(folder: Path, options: OdometryOptions, block: _Block) -> Edges:
     for (i, j), duration in zip(_steps(block.rows), durations, strict=True):
         step = options.registration.register(prepared[i], prepared[j], se3.exp(velocity * duration))
         if step.fitness < SURE_FITNESS:
-            step = max(step, options.registration.register(prepared[i], prepared[j], np.eye(4)), key=_fitness)
+            again = options.registration.register(prepared[i], prepared[j], np.eye(4))
+            step = again if again.fitness > step.fitness else step
         if step.fitness < options.min_fitness:
             step = Registration(se3.exp(velocity * duration), np.zeros((6, 6)), step.fitness, step.rmse_m, 0, 0, False)
         velocity = se3.log(step.i_from_j) / duration
         found.append(step)
     return Edges.of(_steps(block.rows)[block.warm_up :], "sequential").with_registrations(found[block.warm_up :])
-
-
-def _fitness(step: Registration) -> float:
-    return step.fitness
 
 
 def _steps(rows: Ints) -> Ints:

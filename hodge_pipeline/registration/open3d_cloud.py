@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.assessment import MIN_POINTS, assess, to_registration, unregistered
+from hodge_pipeline.registration.assessment import MIN_POINTS, to_registration, unregistered
 from hodge_pipeline.registration.clouds import NORMAL_NEIGHBOURS
 from hodge_pipeline.registration.gicp import PreparedCloud
 from hodge_pipeline.registration.one_thread import o3d
@@ -66,13 +66,5 @@ def register_levels(
             return unregistered(guess)
         motion = se3.from_parts(se3.project_to_so3(result.transformation[:3, :3]), result.transformation[:3, 3])
         iterations += 1
-    assessment = assess(
-        source_points=source.points,
-        target_points=target.points,
-        target_normals=target.normals,
-        find_nearest=target.find_nearest,
-        i_from_j=motion,
-        max_distance_m=max_distance_m,
-        points_per_sample=points_per_sample,
-    )
+    assessment = target.assess(source.points, motion, max_distance_m, points_per_sample)
     return to_registration(assessment, motion, iterations, converged=True)

@@ -16,7 +16,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.assessment import MIN_POINTS, SAME_FITNESS, Assessment, assess, unregistered
+from hodge_pipeline.registration.assessment import MIN_POINTS, SAME_FITNESS, Assessment, unregistered
 from hodge_pipeline.registration.descriptors import match, root_sift
 from hodge_pipeline.registration.gicp import Gicp, PreparedCloud
 from hodge_pipeline.registration.visual import VisualMotion, visual_motion
@@ -148,15 +148,7 @@ class Rgbd:
         return mean if mean.fitness >= found.fitness - SAME_FITNESS else found
 
     def _within(self, target: PreparedFrame, source: PreparedFrame, i_from_j: Floats, distance_m: float) -> Assessment:
-        return assess(
-            source_points=source.sample_points(ASSESSED_POINTS),
-            target_points=target.points,
-            target_normals=target.normals,
-            find_nearest=target.find_nearest,
-            i_from_j=i_from_j,
-            max_distance_m=distance_m,
-            points_per_sample=1.0,
-        )
+        return target.assess(source.sample_points(ASSESSED_POINTS), i_from_j, distance_m, points_per_sample=1.0)
 
     def _assessed(self, target: PreparedFrame, source: PreparedFrame, visual: VisualMotion) -> Registration:
         """The landmarks' motion with what the clouds say of it: a false one shows in the fitness."""
