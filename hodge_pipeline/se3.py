@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.types import Bools, Floats, Trajectory
+from hodge_pipeline.types import Bools, Floats, Ints, Trajectory
 
 SMALL_ANGLE = 1e-4
 SAME_STAMP_S = 1e-6
@@ -207,6 +207,12 @@ def inverse(b_from_a: Floats) -> Floats:
     return from_parts(rotation, -np.einsum("...ij,...j->...i", rotation, b_from_a[..., :3, 3]))
 
 
+def between(world_from_frame: Floats, pairs: Ints) -> Floats:
+    """The motions `i_from_j (..., P, 4, 4)` of pairs (P, 2) of poses (..., N, 4, 4)."""
+    i, j = pairs.T
+    return np.asarray(inverse(world_from_frame[..., i, :, :]) @ world_from_frame[..., j, :, :])
+
+
 def adjoint(b_from_a: Floats) -> Floats:
     """Ad (..., 6, 6) with `b_from_a exp(ξ) = exp(Ad ξ) b_from_a`, order (rotation, translation)."""
     rotation, translation = b_from_a[..., :3, :3], b_from_a[..., :3, 3]
@@ -257,6 +263,19 @@ def project_to_so3(matrix: Floats) -> Floats:
 def rotation_angle(b_from_a: Floats) -> Floats:
     """Angles (...,) of the rotations of motions (..., 4, 4), radians in [0, π]."""
     return np.asarray(np.linalg.norm(so3_log(b_from_a[..., :3, :3]), axis=-1))
+
+
+def displacement_m(b_from_a: Floats, arm_m: float) -> Floats:
+    """How far (...,) motions (..., 4, 4) move what is `arm_m` away: their shift, and their turn as an arc."""
+    return np.asarray(np.linalg.norm(b_from_a[..., :3, 3], axis=-1) + arm_m * rotation_angle(b_from_a))
+
+
+def fit_poses(world_from_cam: Floats, other_from_cam: Floats) -> Floats:
+    """The motion `world_from_other (4, 4)` between two sets of poses (N, 4, 4): their mean turn, and the mean shift
+    that it leaves. Unlike a fit of positions it is fixed where these lie on a line.
+    """
+    turn = project_to_so3((world_from_cam[:, :3, :3] @ np.swapaxes(other_from_cam[:, :3, :3], 1, 2)).mean(axis=0))
+    return from_parts(turn, (world_from_cam[:, :3, 3] - other_from_cam[:, :3, 3] @ turn.T).mean(axis=0))
 
 
 def fit_rigid(points_in_b: Floats, points_in_a: Floats, weights: Floats | None = None) -> Floats:

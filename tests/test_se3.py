@@ -161,3 +161,23 @@ def test_a_quaternion_has_no_negative_scalar_part() -> None:
     np.testing.assert_allclose(
         quats[:, :3], np.sin(np.radians(85)) * np.concatenate([np.eye(3), -np.eye(3)]), atol=1e-12
     )
+
+
+def test_motions_between_poses_lead_from_one_to_the_other():
+    sets = se3.exp(np.random.default_rng(0).normal(size=(2, 4, 6)))
+    pairs = np.array([[0, 1], [3, 2]])
+    found = se3.between(sets, pairs)
+    np.testing.assert_allclose(sets[:, pairs[:, 0]] @ found, sets[:, pairs[:, 1]], atol=1e-12)
+    np.testing.assert_array_equal(se3.between(sets[0], pairs), found[0])
+
+
+def test_poses_on_a_line_fix_the_turn_about_it():
+    poses = np.broadcast_to(np.eye(4), (3, 4, 4)).copy()
+    poses[:, 0, 3] = [0.0, 1.0, 2.0]
+    world_from_other = se3.exp(np.array([0.3, 0.0, 0.0, 1.0, 2.0, 3.0]))
+    np.testing.assert_allclose(se3.fit_poses(world_from_other @ poses, poses), world_from_other, atol=1e-12)
+
+
+def test_a_turn_counts_as_its_arc():
+    motions = se3.exp(np.array([[0.0, 0.5, 0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 3.0, 0.0, 4.0]]))
+    np.testing.assert_allclose(se3.displacement_m(motions, 2.0), [1.0, 5.0])

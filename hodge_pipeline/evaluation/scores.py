@@ -101,15 +101,10 @@ def edge_distances(
     order = np.lexsort((pairs[:, 1], pairs[:, 0]))
     cuts = [order[start : start + PAIRS_PER_BLOCK] for start in range(0, len(order), PAIRS_PER_BLOCK)]
     points = max(LEAST_POINTS, MOST_POINTS // max(1, len(pairs)))
-    blocks = [DistanceBlock(clouds_folder, pairs[cut], _relative(poses, pairs[cut]), points, scale) for cut in cuts]
+    blocks = [DistanceBlock(clouds_folder, pairs[cut], se3.between(poses, pairs[cut]), points, scale) for cut in cuts]
     for block, found in workers.map(block_distances, blocks):
         distances[:, cuts[block]] = found
     return distances.reshape(*world_from_cam.shape[:-3], len(pairs))
-
-
-def _relative(poses: Floats, pairs: Ints) -> Floats:
-    """Motions i_from_j (S, P, 4, 4) of pairs (P, 2) under sets of poses (S, N, 4, 4)."""
-    return np.asarray(se3.inverse(poses[:, pairs[:, 0]]) @ poses[:, pairs[:, 1]])
 
 
 @dataclass(frozen=True)

@@ -59,11 +59,10 @@ def posed(
     for frame, pose in zip(frames[::every], world_from_cam[::every], strict=True):
         if not np.isfinite(pose).all():
             skipped.add("its pose is unknown", frame)
-        elif not taken or min_motion_m == 0 or _moved_m(taken[-1][1], pose) >= min_motion_m:
+        elif (
+            not taken
+            or min_motion_m == 0
+            or se3.displacement_m(se3.inverse(taken[-1][1]) @ pose, se3.ARM_M) >= min_motion_m
+        ):
             taken.append((frame, pose))
     return taken
-
-
-def _moved_m(before: Floats, after: Floats) -> float:
-    twist = se3.log(se3.inverse(before) @ after)
-    return float(np.linalg.norm(twist[:3]) + np.linalg.norm(twist[3:]))

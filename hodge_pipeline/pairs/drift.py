@@ -97,12 +97,7 @@ def best_of_each(pairs: Ints, scores: Floats, most: int, reach: int) -> Ints:
 def path_length_m(world_from_cam: Floats, range_m: float) -> Floats:
     """The path length (N,) up to each pose: steps, and turns as the arc at the scene's median distance."""
     motions = se3.inverse(world_from_cam[:-1]) @ world_from_cam[1:]
-    return np.concatenate([[0.0], np.cumsum(displacement_m(motions, range_m))])
-
-
-def displacement_m(motions: Floats, range_m: float) -> Floats:
-    """How far (...,) motions move what is seen at a distance, metres: their shift, and their turn as an arc."""
-    return np.asarray(np.linalg.norm(motions[..., :3, 3], axis=-1) + range_m * se3.rotation_angle(motions))
+    return np.concatenate([[0.0], np.cumsum(se3.displacement_m(motions, range_m))])
 
 
 def median_range_m(clouds: CloudSet, rows: Ints) -> float:

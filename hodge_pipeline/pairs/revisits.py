@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import dijkstra
 from hodge_pipeline import se3
 from hodge_pipeline.complex.occupancy import voxels
 from hodge_pipeline.pairs.candidates import NO_PAIRS
-from hodge_pipeline.pairs.drift import displacement_m, median_range_m, path_length_m
+from hodge_pipeline.pairs.drift import median_range_m, path_length_m
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.pairs import PreparedClouds
 from hodge_pipeline.stages import Advance, Registrar, no_progress
@@ -181,7 +181,7 @@ class _Path:
 
     def _far(self, motions: Floats) -> Floats:
         """How far (...,) motions move what is seen, metres."""
-        return displacement_m(motions, self._range_m)
+        return se3.displacement_m(motions, self._range_m)
 
 
 def _spaced(rows: Ints) -> Ints:

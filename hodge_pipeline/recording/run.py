@@ -87,8 +87,7 @@ class Recording:
         if self._clouds is None or this.fresh is None or this.before is None or not len(this.fresh):
             return
         registered, before, clouds = this.edges.select(this.fresh), this.before, self._clouds
-        i, j = registered.pairs.T
-        guesses = se3.inverse(before[i]) @ before[j]
+        guesses = se3.between(before, registered.pairs)
         inputs = (number, registered, guesses, clouds)
         self._part("registration", inputs, lambda to: to.registration(number, registered, guesses, clouds))
 

@@ -79,21 +79,20 @@ def explained(
     """How poses (K, 4, 4), called `poses`, explain registered edges (E, 2) with motions (E, 4, 4); a turn counts at
     `arm_m`.
     """
-    turned, moved_m = se3.rotation_angle(i_from_j), np.linalg.norm(i_from_j[:, :3, 3], axis=1)
-    motion_m = float(np.median(turned * arm_m + moved_m)) if len(edges) else 0.0
+    motion_m = float(np.median(se3.displacement_m(i_from_j, arm_m))) if len(edges) else 0.0
     if len(edges) < FEWEST_EDGES or not motion_m > 0:
         return Explained(0.0)
-    given = _motions(world_from_key, edges)
+    given = se3.between(world_from_key, edges)
     missed = _missed_m(given, i_from_j, arm_m) / motion_m
     if not missed > EXPLAINS:
         return Explained(missed)
     of = f"of {counted(len(edges), 'registered pair')}"
-    turned_deg = float(np.rad2deg(np.median(turned)))
+    turned_deg = float(np.rad2deg(np.median(se3.rotation_angle(i_from_j))))
     if se3.rotation_angle(given).max() < SAME_RAD and np.any(given[:, :3, 3]) and turned_deg > TURNED_DEG:
         told = f"the {poses} all have the same rotation, and the camera turned by {turned_deg:.2g}° (median {of})"
         return Explained(missed, f"{told}: give poses with their rotations; positions alone go to positions.path")
     as_others = [
-        _missed_m(_motions(reading.of(world_from_key), edges), i_from_j, arm_m) / motion_m for reading in READINGS
+        _missed_m(se3.between(reading.of(world_from_key), edges), i_from_j, arm_m) / motion_m for reading in READINGS
     ]
     best = int(np.argmin(as_others))
     if as_others[best] >= EXPLAINS * min(missed, 1.0):
@@ -101,10 +100,6 @@ def explained(
     shares = f"as such they miss {as_others[best]:.2f} of the motion (median {of}), as they were read {missed:.2f}"
     looks = f"the {poses} look like {READINGS[best].looks}"
     return Explained(missed, f"{looks}: {shares}: {READINGS[best].advice}")
-
-
-def _motions(world_from_key: Floats, edges: Ints) -> Floats:
-    return np.asarray(se3.inverse(world_from_key[edges[:, 0]]) @ world_from_key[edges[:, 1]])
 
 
 def _missed_m(given: Floats, i_from_j: Floats, arm_m: float) -> float:

@@ -51,13 +51,8 @@ def moves(before: Floats, after: Floats) -> Floats:
 
 
 def _motions(before: Floats, after: Floats) -> Floats:
-    """ξ (B, 6) of each body from the poses before (B, 4, 4), rigidly aligned, to those after.
-
-    The rotation is aligned by orientations, since a few positions may leave it open.
-    """
-    turn = se3.project_to_so3((after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2)).sum(axis=0))
-    shift = (after[:, :3, 3] - before[:, :3, 3] @ turn.T).mean(axis=0)
-    return np.asarray(se3.log(se3.inverse(se3.from_parts(turn, shift) @ before) @ after))
+    """ξ (B, 6) of each body from the poses before (B, 4, 4), aligned by `se3.fit_poses`, to those after."""
+    return se3.log(se3.inverse(se3.fit_poses(after, before) @ before) @ after)
 
 
 def told_apart(start: TrackedModel, model: TrackedModel) -> bool:

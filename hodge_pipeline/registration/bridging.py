@@ -36,7 +36,7 @@ def bridge(
         return steps, poses
     pairs = np.concatenate([_across(pair, rows) for rows in sequences for pair in breaks if np.isin(pair, rows).all()])
     pairs = np.unique(pairs, axis=0)
-    guesses = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
+    guesses = se3.between(poses, pairs)
     found = register_pairs(clouds, options.registration, Edges.of(pairs, "sequential"), guesses, workers)
     bridges, moved = [], poses.copy()
     for i, j in breaks.tolist():

@@ -42,9 +42,8 @@ def register_edges(
     assert clouds.folder is not None
     held_out = edges.status == HELD_OUT
     candidates = edges.select(~held_out)
-    i, j = candidates.pairs.T
-    guesses = se3.inverse(world_from_cam[i]) @ world_from_cam[j]
-    before = guesses if earlier_from is None else se3.inverse(earlier_from[i]) @ earlier_from[j]
+    guesses = se3.between(world_from_cam, candidates.pairs)
+    before = guesses if earlier_from is None else se3.between(earlier_from, candidates.pairs)
     least = HELD_SPREADS * min_spread if isinstance(registrar, Gicp) else np.inf
     rows, known = _reusable(candidates, guesses, before, earlier, scale, least)
     missing = np.setdiff1d(np.arange(len(candidates)), rows)
@@ -87,16 +86,11 @@ def _reusable(
     both = [(row, by_pair[a, b]) for row, (a, b) in enumerate(candidates.pairs.tolist()) if (a, b) in by_pair]
     rows, known = np.array(both, np.int64).reshape(-1, 2).T
     registered = earlier.select(known)
-    moved, moved_before = (_apart(registered, where[rows], scale) for where in (guesses, before))
+    apart = (se3.inverse(registered.i_from_j) @ where[rows] for where in (guesses, before))
+    moved, moved_before = (se3.displacement_m(motions, se3.ARM_M * scale) for motions in apart)
     nearer = (moved < moved_before) & registered.converged & _is_held(registered, least_spread)
     kept = unguessed[known] | (moved < REUSE_WITHIN_M * scale) | nearer
     return rows[kept], known[kept]
-
-
-def _apart(registered: Edges, i_from_j: Floats, scale: float) -> Floats:
-    """Distance (P,) in metres of motions (P, 4, 4) from those registered; an angle counts as its arc at `se3.ARM_M`."""
-    twist = se3.log(se3.inverse(registered.i_from_j) @ i_from_j)
-    return np.asarray(np.linalg.norm(twist[:, 3:], axis=1) + se3.ARM_M * scale * np.linalg.norm(twist[:, :3], axis=1))
 
 
 def _is_held(registered: Edges, least_spread: float) -> Bools:

@@ -67,10 +67,7 @@ def _moved_m(clouds: CloudSet, before: Floats, after: Floats, pairs: Ints) -> Fl
     middle = np.zeros((len(clouds), 3))
     for row in np.flatnonzero(clouds.sizes > 0).tolist():
         middle[row] = np.mean(clouds[row].points_in_cam, axis=0, dtype=float)
-    i, j = pairs.T
-    seen = [
-        se3.transform(se3.inverse(poses[i]) @ poses[j], middle[j][:, None])[:, 0] for poses in (before, after)
-    ]  # fmt: skip
+    seen = [se3.transform(se3.between(poses, pairs), middle[pairs[:, 1], None])[:, 0] for poses in (before, after)]
     return np.asarray(np.linalg.norm(seen[1] - seen[0], axis=1))
 
 
@@ -115,16 +112,9 @@ def four_sides(clouds: CloudSet, before: Floats, after: Floats, component: Ints)
     rows = _some(np.flatnonzero(finite & (component == 0) & (clouds.sizes > 0)))
     if len(rows) < 2:
         return ()
-    aligned = _laid_on(before, after, rows)
+    aligned = se3.fit_poses(after[rows], before[rows]) @ before  # known positions have a world of their own
     scenes = [raster.merged(clouds, poses, rows) for poses in (aligned, after)]
     return sides(scenes, raster.around(scenes[1], after[rows], is_scanner(clouds, rows)), "Before | after")
-
-
-def _laid_on(before: Floats, after: Floats, rows: Ints) -> Floats:
-    """The poses before, turned and moved as these rows are on average: known positions have a world of their own."""
-    turn = se3.project_to_so3((after[rows, :3, :3] @ np.swapaxes(before[rows, :3, :3], 1, 2)).mean(axis=0))
-    shift = (after[rows, :3, 3] - before[rows, :3, 3] @ turn.T).mean(axis=0)
-    return np.asarray(se3.from_parts(turn, shift) @ before)
 
 
 def sides(scenes: Sequence[raster.Points], views: Mapping[str, raster.View], caption: str) -> tuple[Picture, ...]:

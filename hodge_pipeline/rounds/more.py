@@ -36,9 +36,7 @@ class Placed:
         """The motions (P, 4, 4) `i_from_j` that are given or, where that is NaN, those of the poses; NaN for a pair
         that lies in two pieces.
         """
-        i, j = pairs.T
-        poses = se3.inverse(self.world_from_cam[i]) @ self.world_from_cam[j]
-        poses = np.where(self.across(pairs)[:, None, None], np.nan, poses)
+        poses = np.where(self.across(pairs)[:, None, None], np.nan, se3.between(self.world_from_cam, pairs))
         return poses if given is None else np.where(np.isnan(given), poses, given)
 
 

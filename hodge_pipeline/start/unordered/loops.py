@@ -9,7 +9,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
-from hodge_pipeline.pairs.drift import displacement_m, median_range_m, path_length_m
+from hodge_pipeline.pairs.drift import median_range_m, path_length_m
 from hodge_pipeline.pairs.revisits import LOOP_RANGES, Revisits
 from hodge_pipeline.scene import Drift, vertex_ids
 from hodge_pipeline.solvers.backbone.trust import SEQUENTIAL
@@ -31,8 +31,7 @@ def is_worth_it(clouds: CloudSet, odometry: Edges, drift: Drift, revisits: Revis
 def is_long(clouds: CloudSet, odometry: Edges, drift: Drift, revisits: Revisits) -> bool:
     """Whether drift along the path may exceed the reach of `revisits`, which is metric."""
     range_m = median_range_m(clouds, np.flatnonzero(clouds.sizes > 0))
-    i, j = odometry.pairs.T
-    way_m = displacement_m(se3.inverse(drift.world_from_cam[i]) @ drift.world_from_cam[j], range_m).sum()
+    way_m = se3.displacement_m(se3.between(drift.world_from_cam, odometry.pairs), range_m).sum()
     return bool(way_m > revisits.longest_way_m)
 
 
