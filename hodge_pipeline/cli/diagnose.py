@@ -112,8 +112,10 @@ def _energy(row: EnergyRow) -> dict[str, Any]:
 
 
 def _as_json(found: Diagnosed, out: Path | None) -> dict[str, Any]:
+    from hodge_pipeline.diagnosis.result import VERDICTS
+
     graph, diagnosis = found.subject.graph, found.diagnosis
-    counts = {name: int((diagnosis.verdict == name).sum()) for name in ("consistent", "suspect", "wrong", "untestable")}
+    counts = {name: int((diagnosis.verdict == name).sum()) for name in VERDICTS}
     edges = [
         {
             "i": graph.vertex_ids[graph.edges[row, 0]],

@@ -15,7 +15,8 @@ from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.solvers.resistance import Network, effective_resistance
 from hodge_pipeline.types import Bools, Edges, Floats, Ints, ViewGraph
 
-CONSISTENT, SUSPECT, WRONG, UNTESTABLE = "consistent", "suspect", "wrong", "untestable"
+VERDICTS = CONSISTENT, SUSPECT, WRONG, UNTESTABLE = "consistent", "suspect", "wrong", "untestable"
+WORST_FIRST = (WRONG, SUSPECT, UNTESTABLE, CONSISTENT)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M, DistanceBlock, block_distances
+from hodge_pipeline.pairs.centroid import centroids_in_world
 from hodge_pipeline.pairs.overlap import pairwise_iou
 from hodge_pipeline.stages import Workers
 from hodge_pipeline.types import CloudSet, Floats, Ints, PointCloud
@@ -67,8 +68,7 @@ def evaluation_pairs(clouds: CloudSet, world_from_cam: Floats, kind: GraphKind, 
 
 def _near_centroids(clouds: Iterable[PointCloud], world_from_cam: Floats, some: Ints, scale: float) -> Ints:
     """Pairs (P, 2) of one of `some` rows and any row whose centroids are near."""
-    means = np.array([cloud.points_in_cam.mean(axis=0, dtype=float) for cloud in clouds])
-    centroids = np.einsum("nij,nj->ni", world_from_cam[:, :3, :3], means) + world_from_cam[:, :3, 3]
+    centroids = centroids_in_world(clouds, world_from_cam)
     near = cKDTree(centroids[some]).sparse_distance_matrix(
         cKDTree(centroids), scale * CENTROID_DISTANCE_M, output_type="ndarray"
     )

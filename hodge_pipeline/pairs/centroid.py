@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -11,13 +11,13 @@ from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
 from hodge_pipeline.pairs.candidates import NO_PAIRS, usable_rows
-from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Ints
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, PointCloud
 
 
-def centroids_in_world(clouds: CloudSet, world_from_cam: Floats, rows: Ints) -> Floats:
-    """The mean point (R, 3) of the clouds of these rows, metres, under the poses (N, 4, 4)."""
-    means = np.array([clouds[int(row)].points_in_cam.mean(axis=0, dtype=float) for row in rows]).reshape(-1, 1, 3)
-    return se3.transform(world_from_cam[rows], means)[:, 0]
+def centroids_in_world(clouds: Iterable[PointCloud], world_from_cam: Floats) -> Floats:
+    """The mean point (N, 3) of each cloud, metres, under its pose (N, 4, 4)."""
+    means = np.array([cloud.points_in_cam.mean(axis=0, dtype=float) for cloud in clouds]).reshape(-1, 1, 3)
+    return se3.transform(world_from_cam, means)[:, 0]
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -33,5 +33,5 @@ class CentroidEdges:
         rows = usable_rows(clouds, world_from_cam)
         if len(rows) < 2:
             return Edges.proposed(NO_PAIRS, "centroid")
-        tree = cKDTree(centroids_in_world(clouds, world_from_cam, rows))
+        tree = cKDTree(centroids_in_world(clouds.read(rows), world_from_cam[rows]))
         return Edges.proposed(rows[tree.query_pairs(self.max_distance_m, output_type="ndarray")], "centroid")

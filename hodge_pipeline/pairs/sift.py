@@ -15,7 +15,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.pairs.candidates import NO_PAIRS, usable_rows
 from hodge_pipeline.pairs.sequential import SequentialEdges
 from hodge_pipeline.pairs.vlad import global_descriptors, most_similar, vocabulary
-from hodge_pipeline.registration.descriptors import CONFIDENCE, MOST_RANSAC_STEPS, match, root_sift
+from hodge_pipeline.registration.descriptors import CONFIDENCE, LOWE_RATIO, MOST_RANSAC_STEPS, match, root_sift
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame
 from hodge_pipeline.types.text import counted
 
@@ -23,8 +23,6 @@ log = logging.getLogger("hodge_pipeline")
 
 WORDS = 32
 """Of the global descriptors' vocabulary: 16 kB a frame."""
-RATIO = 0.8
-"""A match is this much nearer than the second nearest (Lowe 2004)."""
 MAX_ERROR_PX = 1.5
 """From the epipolar line, for a match to be an inlier."""
 
@@ -82,7 +80,7 @@ def _verified(options: SiftEdges, clouds: CloudSet, seen: bytes, near: bytes) ->
     proposed = np.unique(np.concatenate([np.frombuffer(near, np.int64).reshape(-1, 2), similar]), axis=0)
     shares = np.zeros(len(proposed))
     for at, (i, j) in enumerate(proposed.tolist()):
-        matches = match(local.descriptors(i), local.descriptors(j), RATIO)
+        matches = match(local.descriptors(i), local.descriptors(j), LOWE_RATIO)
         if len(matches) <= options.min_inliers:
             continue
         points_i, points_j = local.points(i)[matches[:, 0]], local.points(j)[matches[:, 1]]

@@ -5,19 +5,20 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
+from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG
 from hodge_pipeline.recording import layout, shapes
 from hodge_pipeline.recording.stream import Part, log_markdown
 from hodge_pipeline.types import Edges, Floats, ViewGraph
 from hodge_pipeline.types.text import markdown_table
 
 COLOURS = {
-    "consistent": (60, 115, 225),
-    "untestable": (150, 150, 150),
-    "suspect": (230, 160, 0),
-    "wrong": (230, 60, 160),
+    CONSISTENT: (60, 115, 225),
+    UNTESTABLE: (150, 150, 150),
+    SUSPECT: (230, 160, 0),
+    WRONG: (230, 60, 160),
 }
 """Blue, grey, amber, magenta: apart in hue and in brightness; whatever else a verdict may be is white."""
-RADII = {"consistent": -0.4, "untestable": -0.6, "suspect": -1.2, "wrong": -1.6}
+RADII = {CONSISTENT: -0.4, UNTESTABLE: -0.6, SUSPECT: -1.2, WRONG: -1.6}
 BYTES_EACH = 160
 LISTED = 40
 
@@ -53,7 +54,7 @@ def summary(graph: ViewGraph, edges: Edges) -> str:
 
 
 def _least_probable(edges: Edges) -> list[int]:
-    rows = np.flatnonzero(np.isin(edges.verdict, ("wrong", "suspect")))
+    rows = np.flatnonzero(np.isin(edges.verdict, (WRONG, SUSPECT)))
     chosen: list[int] = rows[np.argsort(edges.probability[rows], kind="stable")][:LISTED].tolist()
     return chosen
 

@@ -17,7 +17,7 @@ from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.recording.live import Live
 from hodge_pipeline.recording.merge import find_parts, merge
-from hodge_pipeline.recording.recorder import Recorder
+from hodge_pipeline.recording.recorder import Notes, Recorder
 from hodge_pipeline.recording.shapes import is_scanner
 from hodge_pipeline.scene import FIRST, START, Round, given_poses, has_given, has_truth, pose_sets, true_poses
 from hodge_pipeline.stages import Step, Steps
@@ -34,7 +34,6 @@ from hodge_pipeline.types.ply import read_model
 from hodge_pipeline.types.text import markdown_table
 
 FILE = "recording.rrd"
-Notes = tuple[str, ...]
 
 
 class Recording:

@@ -209,10 +209,10 @@ def _add_consistent(
         return None
     solved = solve_bodies(graph, model.world_from_body, options.solver)
     found.notes += solved.solution.notes
-    if not solved.kept.any():
+    if not solved.solution.kept.any():
         found.notes.append(NO_EDGE_LEFT)
         return solved
-    with_depth = bool((solved.kept & (solved.graph.source == "depth")).any())
+    with_depth = bool((solved.solution.kept & (solved.graph.source == "depth")).any())
     priors = position_priors(solved) if with_depth else None
     found.add(CONSISTENT, model, solved.solution.world_from_cam, priors)
     return solved

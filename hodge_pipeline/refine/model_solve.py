@@ -7,21 +7,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.chi2 import chi2_by_information
+from hodge_pipeline.complex.chi2 import MEDIAN_CHI2, chi2_by_information
+from hodge_pipeline.complex.closing import TRIANGLES_PER_EDGE
 from hodge_pipeline.complex.short_cycles import short_cycles
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation.residuals import with_residuals
-from hodge_pipeline.refine.uncertainty import LEAST_WEIGHT
 from hodge_pipeline.solvers.covariance import marginal_covariances
 from hodge_pipeline.stages import ConsistencySolver
-from hodge_pipeline.types import Bools, Edges, Floats, PositionPriors, Solution, ViewGraph
+from hodge_pipeline.types import Edges, Floats, PositionPriors, Solution, ViewGraph
 
-MEDIAN_CHI2, OUTLIER_CHI2 = 5.348, 16.812
-"""Median and 99 % quantile of χ² with six degrees of freedom."""
 ROUNDS = 2
 """Solves, each with information calibrated at the last poses, on which that of edges without cycles depends."""
-LEAST_TRIANGLES, TRIANGLES_PER_EDGE = 10, 8
-"""Fewest triangles whose median counts, and the most that are listed of an edge."""
+LEAST_TRIANGLES = 10
+"""Fewest triangles whose median counts."""
 
 
 @dataclass(frozen=True)
@@ -31,19 +29,9 @@ class Solved:
     graph: ViewGraph
     solution: Solution
 
-    @property
-    def kept(self) -> Bools:
-        """The edges (E,) to which the solver left a weight."""
-        return np.asarray(self.solution.weights > LEAST_WEIGHT)
-
     def edges(self, world_from_body: Floats) -> Edges:
         """The table of the edges with their residuals at the poses (B, 4, 4)."""
         return with_residuals(Edges.measured(self.graph), world_from_body, self.solution.weights)
-
-    def chi2(self, world_from_body: Floats) -> float:
-        """The mean over all edges of χ² per degree of freedom at the poses (B, 4, 4), capped at the 99 % quantile."""
-        squares = np.minimum(chi2_by_information(self.graph, world_from_body), OUTLIER_CHI2)
-        return float(squares.mean() / 6) if len(squares) else float("nan")
 
 
 def calibrated(graph: ViewGraph, world_from_body: Floats) -> ViewGraph:
@@ -62,7 +50,7 @@ def calibrated(graph: ViewGraph, world_from_body: Floats) -> ViewGraph:
         if len(chi2) < LEAST_TRIANGLES:
             chi2 = chi2_by_information(kind, world_from_body)
         middle = float(np.median(chi2))
-        factor[same] = MEDIAN_CHI2 / middle if middle > 0 else 1.0
+        factor[same] = MEDIAN_CHI2[6] / middle if middle > 0 else 1.0
     return replace(graph, information=graph.information * factor[:, None, None])
 
 
@@ -100,7 +88,7 @@ def position_priors(solved: Solved) -> PositionPriors | None:
     the graph is singular.
     """
     poses = solved.solution.world_from_cam
-    kept = solved.graph.select(np.flatnonzero(solved.kept))
+    kept = solved.graph.select(np.flatnonzero(solved.solution.kept))
     rows = np.unique(kept.edges)
     if not len(rows):
         return None

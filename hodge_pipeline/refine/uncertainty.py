@@ -20,8 +20,6 @@ MOST_SAMPLED = 60
 SIGMAS = 2.0
 """Standard deviations in a stated uncertainty: 95 % of a Gaussian."""
 TINY = float(np.finfo(float).tiny)
-LEAST_WEIGHT = 1e-3
-"""Weight below which a robust solver counts as having left an edge out: some keep a small rest."""
 
 
 def mean_chi2(graph: ViewGraph, weights: Floats, world_from_cam: Floats) -> float:
@@ -36,7 +34,7 @@ def pose_change(graph: ViewGraph, solution: Solution, before: Floats) -> PoseCha
     The uncertainty is two standard deviations of a pose relative to the first of its component: marginals of the
     inverse normal matrix times the reduced χ², where that is above 1. NaN where the graph is a tree or singular.
     """
-    used = np.flatnonzero(solution.weights > LEAST_WEIGHT)
+    used = np.flatnonzero(solution.kept)
     moved = se3.inverse(before) @ solution.world_from_cam
     translation_m = rms(np.linalg.norm(moved[:, :3, 3], axis=1))
     rotation_deg = float(np.rad2deg(rms(se3.rotation_angle(moved))))

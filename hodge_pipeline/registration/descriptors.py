@@ -6,6 +6,8 @@ import numpy as np
 
 from hodge_pipeline.types import Bytes, Floats32, Ints
 
+LOWE_RATIO = 0.8
+"""A match is this much nearer than the second nearest (Lowe 2004)."""
 CONFIDENCE, MOST_RANSAC_STEPS = 0.999, 2000
 """Of a search for the one relative pose of two images that most matches agree with."""
 

@@ -6,18 +6,17 @@ import re
 
 import numpy as np
 
-from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
+from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WORST_FIRST, WRONG, Diagnosis
 from hodge_pipeline.types import Bools, Ints
 from hodge_pipeline.types.text import UNKNOWN_UNIT
 
-ORDER = (WRONG, SUSPECT, UNTESTABLE, CONSISTENT)
 SPLITS = 1 - 1e-6
 """Leverage from which an edge is a bridge of the graph."""
 
 
 def ranked(diagnosis: Diagnosis) -> Ints:
     """Rows of all edges, the worst first: wrong, suspect, untestable, consistent; in each the least probable."""
-    place = np.argmax(diagnosis.verdict[:, None] == np.array(ORDER), axis=1)
+    place = np.argmax(diagnosis.verdict[:, None] == np.array(WORST_FIRST), axis=1)
     probability = np.nan_to_num(diagnosis.probability, nan=0.5)
     return np.lexsort((-np.nan_to_num(diagnosis.residual_m, nan=np.inf), probability.round(1), place))
 

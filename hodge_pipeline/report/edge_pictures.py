@@ -13,7 +13,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.result import Diagnosis
 from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.recording.shapes import SCANNER_AXES, is_scanner
-from hodge_pipeline.registration.descriptors import CONFIDENCE, MOST_RANSAC_STEPS, match, root_sift
+from hodge_pipeline.registration.descriptors import CONFIDENCE, LOWE_RATIO, MOST_RANSAC_STEPS, match, root_sift
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.diagnosis_page import EdgePictures
 from hodge_pipeline.report.document import Picture
@@ -32,8 +32,6 @@ CUT_SHARE, SEEN_SHARE = 0.04, 0.03
 """How thick a cut through clouds is, and how large an offset must be to be seen in it: of the clouds' extent."""
 EXAGGERATIONS = (2, 5, 10, 20, 50, 100)
 
-RATIO = 0.8
-"""Lowe's ratio (2004)."""
 MAX_FEATURES = 1000
 MAX_ERROR_PX = 2.0
 """Distance of an inlier from its epipolar line, at most."""
@@ -193,7 +191,7 @@ def draw_matches(first: Bytes, second: Bytes) -> MatchedImages:
     """Two RGB images with a line for each match: green where one relative pose explains it, else grey."""
     canvas = raster.beside([first, second])
     found = [_features(image) for image in (first, second)]
-    pairs = match(found[0][1], found[1][1], RATIO)
+    pairs = match(found[0][1], found[1][1], LOWE_RATIO)
     agreeing = _agreeing(found[0][0], found[1][0], pairs)
     offset = np.array([first.shape[1] + raster.GAP, 0], np.float32)
     for colour, rows in ((ODD_COLOUR, ~agreeing), (AGREEING_COLOUR, agreeing)):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline.complex.components import in_runs
-from hodge_pipeline.diagnosis.result import UNTESTABLE
+from hodge_pipeline.diagnosis.result import UNTESTABLE, VERDICTS, WRONG
 from hodge_pipeline.evaluation.trajectory import AbsoluteError, RelativeError, absolute_error, relative_error
 from hodge_pipeline.registration.pairs import unheld_steps
 from hodge_pipeline.report.contents import ComponentRow, EdgeRow, GraphSummary, TrajectoryRow, WrongEdges
@@ -27,7 +27,6 @@ UNHELD = 0.02
 """Share of steps unconstrained in some direction and tested by no other edge, above which the path is in doubt: none of
 fr1, red kitchen, ICL-NUIM, fr3's cabinet; 6 % of a walk where steps slid by 20 cm; all before a bare wall.
 """
-VERDICTS = ("consistent", "suspect", "wrong", "untestable")
 
 
 def trajectory_rows(
@@ -149,7 +148,7 @@ def worst_edges(edges: Edges, vertex_ids: NDArray[np.generic], count: int = 10) 
 def weigh_wrong(last: Round, solver: ConsistencySolver, *, step: Step) -> WrongEdges:
     """Step: the effect of the edges judged wrong that the solver used, by a solve without them."""
     assert last.solution is not None
-    wrong = (last.graph_edges.verdict == "wrong") & (last.solution.weights > 0)
+    wrong = (last.graph_edges.verdict == WRONG) & (last.solution.weights > 0)
     if not wrong.any():
         return WrongEdges(0)
     frames = _shared_frames(last.graph_edges.pairs[wrong], last.vertex_ids)

@@ -17,8 +17,6 @@ MOST_POINTS = 200_000
 """Points drawn of each cloud."""
 SLICES = 10
 """Random parts of a cloud: a fade shows and hides them, and sends nothing again."""
-CUT_SHARE = 0.04
-"""Half the thickness of a cut, as a share of the size of what is cut."""
 POINT_SHARE = 0.5
 """Size of a point, as a share of the distance between points spread evenly over a square of the cloud's size."""
 LARGEST_POINT = 0.015
@@ -66,7 +64,7 @@ class Closeup:
             self._drawn[name] = key
             self._nodes[name] = self._gizmo(size_m) if placing else self._scene.add_frame(_at(name), show_axes=False)
             points = _some(clouds, row)
-            points = points[pair.kept(points, pose, up, CUT_SHARE)] - middle.astype(np.float32)
+            points = points[pair.kept(points, pose, up)] - middle.astype(np.float32)
             self._parts[name] = [
                 self._scene.add_point_cloud(
                     f"{_at(name)}/{number}", points[number::SLICES], colour, precision="float32",

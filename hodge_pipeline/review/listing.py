@@ -8,9 +8,9 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from hodge_pipeline.diagnosis.result import WORST_FIRST
 from hodge_pipeline.diagnosis.wording import cycle_error, name_cycle
 from hodge_pipeline.pairs.edits import pair_names
-from hodge_pipeline.report.advice import ORDER
 from hodge_pipeline.review.adding import Candidate
 from hodge_pipeline.review.session import Session
 from hodge_pipeline.review.settle import Judged
@@ -112,7 +112,7 @@ def _rounded(score: Floats) -> Floats:
 
 def _ranks(verdict: Words) -> Ints:
     """The place of each verdict in the order of the report, unknown ones last."""
-    places = {name: place for place, name in enumerate(ORDER)}
+    places = {name: place for place, name in enumerate(WORST_FIRST)}
     return np.array([places.get(str(one), len(places)) for one in verdict], np.int64)
 
 

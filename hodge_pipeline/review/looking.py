@@ -13,6 +13,8 @@ from hodge_pipeline.types import Bools, Floats, Floats32, PointCloud
 
 APART = 1.15
 """Distance of clouds side by side, in widths of the first."""
+CUT_SHARE = 0.04
+"""Half the thickness of a cut, as a share of the size of what is cut."""
 EXTENT = 90
 """Percentile of the distances from a cloud's middle that is its size: few points lie far out."""
 
@@ -62,12 +64,12 @@ class Shown:
         second = np.reshape(self.candidate.points_j, (-1, 3))
         return np.concatenate([se3.transform(self.world_from_i, first), se3.transform(self.world_from_j, second)])
 
-    def kept(self, points: Floats32, world_from_cam: Floats, up: Floats, thickness: float) -> Bools:
-        """Which points (N, 3) of a cloud at a pose lie in the cut across `up`; its half `thickness` is in sizes."""
+    def kept(self, points: Floats32, world_from_cam: Floats, up: Floats) -> Bools:
+        """Which points (N, 3) of a cloud at a pose lie in the cut across `up`."""
         if self.cut is None:
             return np.ones(len(points), bool)
         heights = (se3.transform(world_from_cam, np.asarray(points, float)) - self.middle) @ up
-        return np.asarray(np.abs(heights - self.cut * self.size_m) <= thickness * self.size_m)
+        return np.asarray(np.abs(heights - self.cut * self.size_m) <= CUT_SHARE * self.size_m)
 
 
 def shown_pair(session: Session, flip: bool) -> Shown | None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import os
 import socket
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -134,7 +133,7 @@ class Viewer:
         self._folder.cleanup()
 
 
-@contextlib.contextmanager
+@contextmanager
 def _listening_on(path: Path) -> Iterator[None]:
     """While the body runs websockets listens on this Unix socket in place of a port: viser has no option for that."""
     from websockets.asyncio import server
@@ -151,8 +150,8 @@ def _listening_on(path: Path) -> Iterator[None]:
         server.serve = original  # type: ignore[misc]
 
 
-@contextlib.contextmanager
+@contextmanager
 def _silent() -> Iterator[None]:
     """While the body runs nothing is printed: viser prints an address that nobody can open."""
-    with contextlib.redirect_stdout(io.StringIO()):
+    with redirect_stdout(io.StringIO()):
         yield

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
+from hodge_pipeline.diagnosis.result import VERDICTS
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.edits import pair_names
 from hodge_pipeline.report.document import Picture
@@ -21,7 +22,7 @@ from hodge_pipeline.report.edge_pictures import edge_pictures
 from hodge_pipeline.review.front import Answer, Route, Site
 from hodge_pipeline.review.keeping import save
 from hodge_pipeline.review.listing import Query, describe, list_edges, state
-from hodge_pipeline.review.session import ALL_VERDICTS, MODES, Session
+from hodge_pipeline.review.session import MODES, Session
 from hodge_pipeline.rounds.suggestions import suggest_pairs
 from hodge_pipeline.stages import Advance
 from hodge_pipeline.types.input_files import read_input
@@ -225,7 +226,7 @@ def _look(asked: Asked) -> dict[str, Any]:
         changes["cut"] = None if asked["cut"] is None else _number(asked, "cut")
     if "verdicts" in asked:
         if not isinstance(asked["verdicts"], list):
-            raise GraphError(f"verdicts: expected a list of {', '.join(ALL_VERDICTS)}")
+            raise GraphError(f"verdicts: expected a list of {', '.join(VERDICTS)}")
         changes["verdicts"] = tuple(map(str, asked["verdicts"]))
     return changes
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG
+from hodge_pipeline.diagnosis.result import SUSPECT, VERDICTS, WRONG
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.edits import ENABLED, REGISTERED, RIGHT, Edit, pair_names, vertex_rows
 from hodge_pipeline.recipe.schema import Recipe
@@ -34,8 +34,6 @@ _EDITS: dict[str, Callable[[tuple[str, ...]], Edit]] = {
 }
 _SWITCHES = {"disable": DISABLED, "enable": ENABLED, "right": RIGHT}
 VERBS = tuple(_EDITS)
-ALL_VERDICTS = (WRONG, SUSPECT, UNTESTABLE, CONSISTENT)
-"""Shown where no edge is wrong or suspect: an empty page would tell nothing."""
 CANDIDATE_MODES = ("apart", "place")
 MODES = ("all", "edge", "solution", "blink", "between", *CANDIDATE_MODES)
 """How the scene shows edges; see `Look`."""
@@ -236,7 +234,7 @@ class Session:
         with self.changed:
             if table is self.table:
                 if self.judged is None and not np.isin(judged.edges.verdict, self.look.verdicts).any():
-                    self.look = replace(self.look, verdicts=ALL_VERDICTS)
+                    self.look = replace(self.look, verdicts=VERDICTS)  # an empty page would tell nothing
                 self.judged = judged
                 self.table = replace(table, edges=judged.edges)
             self.bump()

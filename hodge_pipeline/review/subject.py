@@ -165,7 +165,7 @@ def _of_model(path: Path) -> Subject:
     source = Source(path.resolve().name, path, frames, notes=(*left_out, *model.notes, *notes, UNITS))
     return replace(
         _beside(path, source, Edges.measured(solved.graph), solved.graph, solved.solution),
-        solution=replace(solved.solution, weights=np.where(solved.kept, solved.solution.weights, 0.0)),
+        solution=replace(solved.solution, weights=np.where(solved.solution.kept, solved.solution.weights, 0.0)),
         clouds=model.seen_points(),
         frames=frames if any(frame.read_colour is not None for frame in frames) else (),
         model=model,

@@ -31,8 +31,6 @@ from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Solution,
 from hodge_pipeline.types.edges import HELD_OUT
 from hodge_pipeline.types.notes import Note, notes_of
 
-LEFT_OUT = 1e-3
-"""Weight below which a robust solver counts as having left an edge out: some keep a small rest."""
 EDITED = "edited"
 """The name of a round that a person's edits made."""
 
@@ -238,7 +236,7 @@ def solve_edges(
 
 def with_right(graph: ViewGraph, solution: Solution, right: Bools) -> Solution:
     """The solution with the `right (E,)` edges put back that a robust solver left out."""
-    left_out = np.flatnonzero(right & (solution.weights < LEFT_OUT))
+    left_out = np.flatnonzero(right & ~solution.kept)
     if not len(left_out):
         return solution
     editor = GraphEditor(graph, solution)

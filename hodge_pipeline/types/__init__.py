@@ -25,6 +25,9 @@ from hodge_pipeline.types.edges import ViewGraph as ViewGraph
 from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.positions import Positions as Positions
 
+LEAST_WEIGHT = 1e-3
+"""Weight of an edge, relative to its own information, above which it counts."""
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -206,6 +209,11 @@ class Solution:
     stopped_by: str = ""
     certified: bool | None = None
     confirmed: bool | None = None
+
+    @property
+    def kept(self) -> Bools:
+        """Where (E,) an edge counts: robust solvers leave a small rest of weight to some that they leave out."""
+        return np.asarray(self.weights > LEAST_WEIGHT)
 
     def __repr__(self) -> str:
         pieces = int(self.component.max(initial=-1)) + 1
