@@ -25,8 +25,8 @@ from hodge_pipeline.report.contents import (
 )
 from hodge_pipeline.report.run_page import document
 from hodge_pipeline.report.summary import graph_summary, in_runs, trajectory_rows
+from hodge_pipeline.report.suspicions import suspicions
 from hodge_pipeline.report.tables import score_tables, stages_table, worst_edges_table
-from hodge_pipeline.report.verdict import suspicions
 from hodge_pipeline.report.words import next_commands, worst_places
 from hodge_pipeline.report.write import as_json, write_report
 from hodge_pipeline.types import Edges

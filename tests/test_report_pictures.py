@@ -15,7 +15,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recording.shapes import up_and_ahead
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.contents import EdgeRow, Pictures, Report, SourceSummary, paths_of
-from hodge_pipeline.report.painting import turns_deg
+from hodge_pipeline.report.error_plots import turns_deg
 from hodge_pipeline.report.run_report import _pictures
 from hodge_pipeline.report.scene_pictures import changed_most, four_sides, worst_pairs
 from hodge_pipeline.scene import KeyFrames, Round, Scene, pose_sets

@@ -25,7 +25,8 @@ from hodge_pipeline.report.contents import (
 )
 from hodge_pipeline.report.refined import summary
 from hodge_pipeline.report.summary import graph_summary, unheld, weigh_wrong
-from hodge_pipeline.report.verdict import judge, suspicions
+from hodge_pipeline.report.suspicions import suspicions
+from hodge_pipeline.report.verdict import judge
 from hodge_pipeline.report.write import write_report
 from hodge_pipeline.scene import Round
 from hodge_pipeline.solvers.maximum_likelihood import MaximumLikelihoodSolver

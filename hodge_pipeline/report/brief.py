@@ -6,7 +6,8 @@ import textwrap
 from collections.abc import Iterator
 
 from hodge_pipeline.report.contents import Report
-from hodge_pipeline.report.verdict import judge, suspicions
+from hodge_pipeline.report.suspicions import suspicions
+from hodge_pipeline.report.verdict import judge
 from hodge_pipeline.report.words import duration, next_commands, peak, worst_places
 from hodge_pipeline.types.notes import Rank
 from hodge_pipeline.types.text import with_symbols

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from hodge_pipeline.complex.energies import Energies
-from hodge_pipeline.evaluation.difference import length
+from hodge_pipeline.evaluation.difference import MEASURABLE, floor_of, length
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.refine.guard import Measure
@@ -21,6 +21,10 @@ from hodge_pipeline.types.positions import PositionFit
 
 NOTHING_TO_DO_M = 0.005
 """Change of poses in a room that may be ignored: a quarter of the voxel of clouds."""
+TRUTH = "truth"
+"""The name of the true poses."""
+GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
+"""What the pairs are called that poses are scored on."""
 
 
 @dataclass(frozen=True)
@@ -271,6 +275,16 @@ class Report:
     def scale(self) -> float:
         """The unit that recipes are written in, in metres: 1 in a room."""
         return self.scores.scale if self.scores else 1.0
+
+    @property
+    def floor_m(self) -> float:
+        """The least difference of lengths that the report takes for one: see `MEASURABLE`.
+
+        The extent is that of the positions, or the unit that recipes are written in (1 m in a room) where that is
+        larger.
+        """
+        scale = self.scores.scale if self.scores else 0.0
+        return max(floor_of(*(path.positions for path in self.pictures.paths)), MEASURABLE * scale)
 
     @property
     def pieces(self) -> tuple[int, ...]:

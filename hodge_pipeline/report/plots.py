@@ -12,7 +12,8 @@ from matplotlib.ticker import LogFormatter
 
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.document import Picture
-from hodge_pipeline.report.painting import error_plots, flattest_plane, has_truth, map_axes, matrix_axes, painted
+from hodge_pipeline.report.error_plots import error_plots, has_truth
+from hodge_pipeline.report.painting import flattest_plane, map_axes, matrix_axes, painted
 from hodge_pipeline.report.tables import counted_pairs
 from hodge_pipeline.types import Floats, Ints
 from hodge_pipeline.types.text import UNKNOWN_UNIT

@@ -5,8 +5,9 @@ from __future__ import annotations
 from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.document import Banner, Document, Mark, Section
 from hodge_pipeline.report.plots import draw, draw_convergence
+from hodge_pipeline.report.suspicions import suspicions
 from hodge_pipeline.report.tables import graph_tables, score_tables, source_table, stages_table, worst_edges_table
-from hodge_pipeline.report.verdict import Outcome, capital, judge, suspicions
+from hodge_pipeline.report.verdict import Outcome, capital, judge
 from hodge_pipeline.report.words import duration, next_commands, peak, worst_places
 from hodge_pipeline.types.notes import Rank
 from hodge_pipeline.types.text import counted

@@ -9,9 +9,8 @@ import numpy as np
 from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.evaluation.scores import SIGMA_M, GraphScores
 from hodge_pipeline.report import known_positions
-from hodge_pipeline.report.contents import RefinementSummary, Report
+from hodge_pipeline.report.contents import GRAPH_NAMES, RefinementSummary, Report
 from hodge_pipeline.report.document import Table
-from hodge_pipeline.report.verdict import GRAPH_NAMES, floor_m
 from hodge_pipeline.types.text import counted
 
 
@@ -121,7 +120,7 @@ def _score_cells(graph: GraphScores, row: int) -> tuple[str, str, str]:
 def _trajectories(report: Report) -> Table:
     header = ("poses", "ATE", "median", "largest", "RPE", "RPE, rotation", "frames")
     absolute_m = max((row.ate_rmse_m for row in report.trajectories if row.frames), default=0.0)
-    floor = floor_m(report)
+    floor = report.floor_m
     relative_m = max((row.rpe_translation_m for row in report.trajectories if row.frames), default=0.0)
     rows = tuple(
         (

@@ -1,4 +1,4 @@
-"""Whether the run made the poses better, and what a reader should distrust."""
+"""Whether the run made the poses better."""
 
 from __future__ import annotations
 
@@ -8,26 +8,12 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M, REACH_M
-from hodge_pipeline.evaluation.difference import MEASURABLE, Change, floor_of, length
-from hodge_pipeline.report import known_positions
-from hodge_pipeline.report.contents import GraphSummary, Report, TrajectoryRow
-from hodge_pipeline.rounds.settling import settled_m
-from hodge_pipeline.types.notes import Note
+from hodge_pipeline.evaluation.difference import MEASURABLE, Change
+from hodge_pipeline.report.contents import GRAPH_NAMES, Report
+from hodge_pipeline.report.suspicions import other_scale, unsettled, wrong_edges
 
 Outcome: TypeAlias = Literal["improved", "unchanged", "worse", "mixed", "not measured"]
 
-LARGE_RESIDUAL_DEG = 5.0
-"""Turns a point a little more than a metre away out of `REACH_M`, the residual of a position that is large."""
-UNMATCHED_SHARE = 0.01
-"""Of pairs, each of which counts as `NO_NEIGHBOUR_M`: at this share they add a millimetre to the mean distance."""
-OTHER_SCALE, EXPLAINED = 1.1, 0.25
-"""The factor between the true path and the result from which one is not in metres, if scaling by it leaves less than a
-quarter of the error: focal lengths are known to a few per cent, and units differ by 5 or 1000.
-"""
-NOTHING_MOVED_M = 0.0005
-"""The least movement that is reported, in a room."""
-TRUTH = "truth"
 MOST_SIZES = 3
 """Pieces whose sizes a headline tells."""
 NO_MEASURE = "nothing was there to compare the poses by, before and after."
@@ -70,7 +56,6 @@ of `in doubt, since …` (`REASONS`), whatever the measures say."""
 OF_MOST = {"tracking lost", "images unread"}
 MOSTLY_LOST = 0.5
 """The share of the frames."""
-GRAPH_NAMES = {"distance": "near-centroid pairs", "iou": "overlapping pairs"}
 
 
 @dataclass(frozen=True)
@@ -119,7 +104,7 @@ def judge(report: Report) -> Verdict:
         all_joined = report.source.unordered and len(report.pieces) == 1 and outcome in ("improved", "unchanged")
         headline = pieces if all_joined else f"{pieces}: {headline[:1].lower()}{headline[1:]}"
     told = sorted(
-        (*_unsettled(report), *_other_scale(report), *report.notes, *_wrong(report)), key=lambda note: note.rank
+        (*unsettled(report), *other_scale(report), *report.notes, *wrong_edges(report)), key=lambda note: note.rank
     )
     apart = {"left apart"} if len(report.pieces) > 1 else set()  # then nothing joins them, and the headline says so
     reasons = " and ".join(REASONS[note.kind] for note in told if note.kind in REASONS.keys() - apart)
@@ -192,7 +177,7 @@ def _score_changes(report: Report) -> Iterator[Change]:
         if graph.counts[before] and graph.counts[after]:
             name = GRAPH_NAMES[graph.kind]
             what, short = f"the mean distance of overlapping clouds ({name})", f"distance of clouds ({name})"
-            yield Change(what, short, float(distance[before]), float(distance[after]), floor_m(report))
+            yield Change(what, short, float(distance[before]), float(distance[after]), report.floor_m)
 
 
 def _trajectory_changes(report: Report) -> Iterator[Change]:
@@ -200,7 +185,7 @@ def _trajectory_changes(report: Report) -> Iterator[Change]:
     if report.before not in rows or report.after not in rows:
         return
     before, after = rows[report.before], rows[report.after]
-    floor = floor_m(report)
+    floor = report.floor_m
     yield Change("the error of the trajectory (ATE)", "ATE", before.ate_rmse_m, after.ate_rmse_m, floor)
     largest = Change("the largest error of a position", "largest error", before.ate_max_m, after.ate_max_m, floor)
     if largest.sign < 0:
@@ -212,126 +197,3 @@ def _trajectory_changes(report: Report) -> Iterator[Change]:
     yield Change(what, "RPE", before.rpe_translation_m, after.rpe_translation_m, floor)
     what, floor_deg = f"the error of the rotation {step} (RPE)", float(np.rad2deg(MEASURABLE))
     yield Change(what, "RPE of the rotation", before.rpe_rotation_deg, after.rpe_rotation_deg, floor_deg, "°")
-
-
-def floor_m(report: Report) -> float:
-    """The least difference of lengths that the report takes for one: see `MEASURABLE`.
-
-    The extent is that of the positions, or the unit that recipes are written in (1 m in a room) where that is larger.
-    """
-    scale = report.scores.scale if report.scores else 0.0
-    return max(floor_of(*(path.positions for path in report.pictures.paths)), MEASURABLE * scale)
-
-
-def suspicions(report: Report) -> tuple[Note, ...]:
-    """What a reader should distrust and what else is to be known, by rank; the run's own notes come first in each."""
-    found = (
-        *_unsettled(report),
-        *_other_scale(report),
-        *(() if report.position_fit is None else known_positions.notes(report.position_fit)),
-        *report.notes,
-        *(() if report.graph is None else _graph_suspicions(report.graph)),
-        *_wrong(report),
-        *_edge_suspicions(report),
-        *_above_truth(report),
-        *_unmatched(report),
-        *(note for row in report.trajectories for note in _trajectory_suspicions(row)),
-    )
-    return tuple(sorted(found, key=lambda note: note.rank))
-
-
-def _unsettled(report: Report) -> Iterator[Note]:
-    after = [path.positions for path in report.pictures.paths if path.name == report.after] or [np.zeros((0, 3))]
-    if report.last_shift_m is not None and report.last_shift_m > settled_m(after[0], report.scale):
-        yield Note("unsettled", detail=length(report.last_shift_m))
-
-
-def _other_scale(report: Report) -> Iterator[Note]:
-    """A note where the true path is a scaled copy of the result's, in the largest component."""
-    paths = {path.name: path.positions for path in report.pictures.paths}
-    if not report.has_metres or TRUTH not in paths or report.after not in paths:
-        return
-    x, y, component = paths[report.after], paths[TRUTH], report.pictures.component
-    if len(component) != len(x):
-        return
-    rows = (component == np.bincount(component).argmax()) & np.isfinite(x + y).all(axis=1)
-    if rows.sum() < 3:
-        return
-    x, y = x[rows] - x[rows].mean(axis=0), y[rows] - y[rows].mean(axis=0)
-    scale = float(np.sum(x * y) / max(np.sum(x * x), np.finfo(float).tiny))
-    explained = np.sum((scale * x - y) ** 2) < EXPLAINED**2 * np.sum((x - y) ** 2)
-    if explained and (scale > OTHER_SCALE or 0 < scale < 1 / OTHER_SCALE):
-        yield Note("other scale", detail=f"{float(f'{scale:.2g}'):g}")
-
-
-def _graph_suspicions(graph: GraphSummary) -> Iterator[Note]:
-    if len(graph.components) > 1:
-        yield Note("parts", len(graph.components))
-    alone = sum(part.count == 1 for part in graph.components)
-    if alone and graph.vertices > 1:
-        yield Note("alone", alone, str(graph.vertices))
-    if graph.edges_ignored:
-        yield Note("edges ignored", graph.edges_ignored, str(graph.edges))
-    if suspect := graph.verdicts_in_use.get("suspect", 0):
-        yield Note("suspect", suspect)
-    if untestable := graph.verdicts.get("untestable", 0):
-        yield Note("untestable", untestable, str(graph.edges))
-
-
-def _wrong(report: Report) -> Iterator[Note]:
-    """A note on the edges judged wrong, by their effect on the poses."""
-    wrong = report.wrong_edges
-    if wrong is None or not wrong.count:
-        return
-    moved = report.length(max(wrong.moved_m, NOTHING_MOVED_M * report.scale))
-    if not wrong.matters(report.scale):
-        yield Note("harmless", wrong.count, f"{wrong.frames}; without them no pose moves by more than {moved}")
-    elif wrong.pieces_more:
-        yield Note(
-            "wrong", wrong.count, f"{wrong.frames}; without them the scene falls into {wrong.pieces_more} more pieces"
-        )
-    else:
-        yield Note("wrong", wrong.count, f"{wrong.frames}; without them poses move by up to {moved}")
-
-
-def _above_truth(report: Report) -> Iterator[Note]:
-    """A note where clouds fit better at the result than at the true poses."""
-    table = report.scores
-    if table is None or TRUTH not in table.names or report.after not in table.names:
-        return
-    truth, after = table.names.index(TRUTH), table.names.index(report.after)
-    if any(graph.mean_score[after] > graph.mean_score[truth] for graph in table.graphs):
-        yield Note("above truth")
-
-
-def _edge_suspicions(report: Report) -> Iterator[Note]:
-    large = [
-        edge
-        for edge in report.worst_edges
-        if edge.weight > 0 and (edge.residual_m > _large_m(report) or edge.residual_deg > LARGE_RESIDUAL_DEG)
-    ]
-    if large:
-        far = f"{length(_large_m(report))} or " if report.has_metres else ""
-        yield Note("edges far off", len(large), f"{far}{LARGE_RESIDUAL_DEG:g}°")
-
-
-def _large_m(report: Report) -> float:
-    return REACH_M * report.scale if report.has_metres else float("inf")
-
-
-def _unmatched(report: Report) -> Iterator[Note]:
-    if report.scores is None:
-        return
-    for graph in report.scores.graphs:
-        for name, unmatched, count in zip(report.scores.names, graph.unmatched, graph.counts, strict=True):
-            if unmatched > UNMATCHED_SHARE * count:
-                pairs = f"{unmatched} of {count} {GRAPH_NAMES[graph.kind]}"
-                far = length(graph.scale * NO_NEIGHBOUR_M)
-                yield Note("unmatched", int(unmatched), f"{name}: {pairs} have no point within {far}")
-
-
-def _trajectory_suspicions(row: TrajectoryRow) -> Iterator[Note]:
-    if row.left_out:
-        yield Note("not in the error", row.left_out, f"{row.name}, {row.of}")
-    if row.degenerate:
-        yield Note("degenerate", detail=row.name)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from hodge_pipeline.report.contents import Report
-from hodge_pipeline.report.painting import has_truth, offsets
+from hodge_pipeline.report.error_plots import has_truth, offsets
 from hodge_pipeline.report.tables import peak_mb
 from hodge_pipeline.report.verdict import capital
 from hodge_pipeline.types.text import command

@@ -12,7 +12,8 @@ from hodge_pipeline.report import known_positions
 from hodge_pipeline.report.contents import RefinementSummary, Report
 from hodge_pipeline.report.document import render
 from hodge_pipeline.report.run_page import document
-from hodge_pipeline.report.verdict import judge, suspicions
+from hodge_pipeline.report.suspicions import suspicions
+from hodge_pipeline.report.verdict import judge
 from hodge_pipeline.store.artifacts import write_json, write_text
 
 FORMAT_VERSION = 3

@@ -15,11 +15,11 @@ from hodge_pipeline.evaluation.difference import floor_of, length, percent, sign
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recording.comparison import record_comparison
 from hodge_pipeline.report import raster
-from hodge_pipeline.report.contents import GraphSummary, Pictures, Report, SourceSummary, paths_of
+from hodge_pipeline.report.contents import GRAPH_NAMES, GraphSummary, Pictures, Report, SourceSummary, paths_of
 from hodge_pipeline.report.document import Banner, Document, Picture, Section, Table, markdown, render
 from hodge_pipeline.report.plots import draw
 from hodge_pipeline.report.scene_pictures import sides
-from hodge_pipeline.report.verdict import GRAPH_NAMES, judge
+from hodge_pipeline.report.verdict import judge
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import is_clock
 from hodge_pipeline.store import yaml_file

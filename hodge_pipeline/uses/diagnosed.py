@@ -18,7 +18,7 @@ from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.report.advice import advice, in_unit, ranked
 from hodge_pipeline.report.diagnosis_page import sentence
 from hodge_pipeline.report.energy import EnergyRow, energy_rows
-from hodge_pipeline.report.verdict import NOTHING_MOVED_M
+from hodge_pipeline.report.suspicions import NOTHING_MOVED_M
 from hodge_pipeline.rounds.suggestions import Suggestions, suggest_pairs
 from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.store.edge_table import read_edges
