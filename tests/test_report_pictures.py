@@ -12,7 +12,6 @@ from PIL import Image
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.recording.shapes import up_and_ahead
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.contents import EdgeRow, Pictures, Report, SourceSummary, paths_of
 from hodge_pipeline.report.error_plots import turns_deg
@@ -20,6 +19,7 @@ from hodge_pipeline.report.run_report import _pictures
 from hodge_pipeline.report.scene_pictures import changed_most, four_sides, worst_pairs
 from hodge_pipeline.scene import KeyFrames, Round, Scene, pose_sets
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, PointCloud, Solution, Source, ViewGraph
+from hodge_pipeline.types.axes import up_and_ahead
 
 pytestmark = pytest.mark.draws
 RED, BLUE = (200, 0, 0), (0, 0, 200)

@@ -9,8 +9,8 @@ import numpy as np
 from rerun.chunk import Chunk
 
 from hodge_pipeline import se3
-from hodge_pipeline.recording.shapes import up_and_ahead
 from hodge_pipeline.types import Floats
+from hodge_pipeline.types.axes import up_and_ahead
 
 ELEVATION = 0.6
 DISTANCE = 0.8

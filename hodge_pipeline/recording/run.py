@@ -18,7 +18,6 @@ from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.recording.live import Live
 from hodge_pipeline.recording.merge import find_parts, merge
 from hodge_pipeline.recording.recorder import Notes, Recorder
-from hodge_pipeline.recording.shapes import is_scanner
 from hodge_pipeline.scene import FIRST, START, Round, given_poses, has_given, has_truth, pose_sets, true_poses
 from hodge_pipeline.stages import Step, Steps
 from hodge_pipeline.start.clouds import clouds as clouds_step
@@ -28,6 +27,7 @@ from hodge_pipeline.store.progress import RECORDING
 from hodge_pipeline.store.store import stored
 from hodge_pipeline.store.workspace import RECIPE_FILE, RUN, identity_of
 from hodge_pipeline.types import CloudSet, Floats, Ints, Source
+from hodge_pipeline.types.axes import is_scanner
 from hodge_pipeline.types.input_files import read_input_text
 from hodge_pipeline.types.notes import notes_of
 from hodge_pipeline.types.ply import read_model

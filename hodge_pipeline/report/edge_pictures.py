@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.result import Diagnosis
 from hodge_pipeline.evaluation.difference import length
-from hodge_pipeline.recording.shapes import SCANNER_AXES, is_scanner
 from hodge_pipeline.registration.descriptors import CONFIDENCE, LOWE_RATIO, MOST_RANSAC_STEPS, match, root_sift
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.diagnosis_page import EdgePictures
@@ -20,6 +19,7 @@ from hodge_pipeline.report.document import Picture
 from hodge_pipeline.report.painting import painted
 from hodge_pipeline.report.scene_pictures import images_of
 from hodge_pipeline.types import Bytes, CloudSet, Floats, Floats32, Frame, Ints, PointCloud, ViewGraph
+from hodge_pipeline.types.axes import SCANNER_AXES, is_scanner
 from hodge_pipeline.types.text import UNKNOWN_UNIT
 
 IMAGE_WIDTH = 420

@@ -11,8 +11,9 @@ import numpy as np
 from PIL import Image
 
 from hodge_pipeline import se3
-from hodge_pipeline.recording.shapes import or_grey, unit, up_and_ahead
+from hodge_pipeline.recording.shapes import or_grey
 from hodge_pipeline.types import Bytes, CloudSet, Floats, Floats32, Ints, PointCloud
+from hodge_pipeline.types.axes import unit, up_and_ahead
 
 WIDTH, HEIGHT = 560, 400
 ELEVATION_RAD = np.deg2rad(38.0)

@@ -15,7 +15,6 @@ from hodge_pipeline.evaluation.scores import ScoreTable
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe import binding
 from hodge_pipeline.recipe.schema import Recipe
-from hodge_pipeline.recording.shapes import is_scanner
 from hodge_pipeline.refine.given_poses import Refined
 from hodge_pipeline.report.contents import (
     EdgeRow,
@@ -50,6 +49,7 @@ from hodge_pipeline.scene import (
 from hodge_pipeline.store import yaml_file
 from hodge_pipeline.store.store import Store, versions
 from hodge_pipeline.types import Floats, Ints, Solution
+from hodge_pipeline.types.axes import is_scanner
 
 KEY_OF_CACHE = r"-[0-9a-f]{12}$"
 """The hash at the end of a cached folder's name, which is left out of titles."""

@@ -13,12 +13,12 @@ from scipy.ndimage import uniform_filter
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.difference import length
-from hodge_pipeline.recording.shapes import is_scanner
 from hodge_pipeline.report import raster
 from hodge_pipeline.report.contents import EdgeRow
 from hodge_pipeline.report.document import Picture
 from hodge_pipeline.types import Bytes, CloudSet, Floats, Frame, Ints, Source
 from hodge_pipeline.types.arrays import evenly
+from hodge_pipeline.types.axes import is_scanner
 
 FRAMES = 200
 """Frames whose clouds are merged: more of them add nothing that is seen in a picture."""

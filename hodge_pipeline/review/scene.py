@@ -10,7 +10,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG
-from hodge_pipeline.recording.shapes import or_grey, up_and_ahead
+from hodge_pipeline.recording.shapes import or_grey
 from hodge_pipeline.report.diagnosis_plots import COLOURS as REPORTED
 from hodge_pipeline.review.closeup import Closeup, placed, quat_wxyz
 from hodge_pipeline.review.listing import witnesses
@@ -18,6 +18,7 @@ from hodge_pipeline.review.looking import Shown, ball, shown_pair
 from hodge_pipeline.review.picking import nearest_point, nearest_segment
 from hodge_pipeline.review.session import Session
 from hodge_pipeline.types import CloudSet, Floats, Floats32, Ints
+from hodge_pipeline.types.axes import up_and_ahead
 
 COLOURS = {verdict: tuple(bytes.fromhex(colour[1:])) for verdict, colour in REPORTED.items()}
 SELECTED, BEFORE = (190, 0, 190), (170, 170, 200)

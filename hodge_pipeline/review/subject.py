@@ -11,7 +11,6 @@ import numpy as np
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.pairs.edits import FILE
 from hodge_pipeline.recipe.schema import Recipe
-from hodge_pipeline.recording.shapes import is_scanner
 from hodge_pipeline.refine.candidates import NO_EDGE
 from hodge_pipeline.refine.model import refinable
 from hodge_pipeline.refine.model_options import load_model_refinement
@@ -24,6 +23,7 @@ from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.sources.inspect import guesses
 from hodge_pipeline.store.workspace import is_run_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Solution, Source, ViewGraph
+from hodge_pipeline.types.axes import is_scanner
 from hodge_pipeline.types.edges import DISABLED, REJECTED, USED
 from hodge_pipeline.types.text import UNKNOWN_UNIT
 from hodge_pipeline.types.tracked_model import TrackedModel
