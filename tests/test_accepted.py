@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.acceptance import accepted, with_odometry
+from hodge_pipeline.registration.acceptance import Acceptance, accepted, with_odometry
 from hodge_pipeline.registration.odometry_path import contradicts_odometry, drift_of, without_slides
-from hodge_pipeline.registration.pairs import Acceptance
 from hodge_pipeline.scene import Drift
 from hodge_pipeline.types import Edges, Floats, Registration
 

@@ -14,10 +14,11 @@ from hodge_pipeline import se3
 from hodge_pipeline.executors.local import InProcess, LocalExecutor
 from hodge_pipeline.registration import odometry as odometry_stage
 from hodge_pipeline.registration import pairs as pair_stage
+from hodge_pipeline.registration.acceptance import Acceptance
 from hodge_pipeline.registration.gaps import gaps, over_gap, told_gaps
 from hodge_pipeline.registration.gicp import Gicp, Vgicp
 from hodge_pipeline.registration.odometry import OdometryOptions, odometry
-from hodge_pipeline.registration.pairs import Acceptance, register_pairs
+from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.registration.register import register_edges
 from hodge_pipeline.stages import Registrar, Step, Workers
 from hodge_pipeline.types import CloudSet, Edges, Floats, PointCloud

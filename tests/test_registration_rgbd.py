@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hodge_pipeline import se3
 from hodge_pipeline.registration.descriptors import match, root_sift
 from hodge_pipeline.registration.landmarks import find_landmarks
-from hodge_pipeline.registration.resection import back_project
+from hodge_pipeline.registration.pixels import back_project
 from hodge_pipeline.registration.rgbd import Rgbd, guided_match
 from hodge_pipeline.registration.visual import VisualMotion, fit_triples, visual_motion
 from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats, Floats32, Frame, Landmarks, PointCloud

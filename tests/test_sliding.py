@@ -9,7 +9,8 @@ import pytest
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.free_directions import free_direction_notes
-from hodge_pipeline.registration.pairs import Acceptance, held_where_sliding
+from hodge_pipeline.registration.acceptance import Acceptance
+from hodge_pipeline.registration.sliding import held_where_sliding
 from hodge_pipeline.solvers.maximum_likelihood import MaximumLikelihoodSolver
 from hodge_pipeline.types import Edges, Floats, Frame, PointCloud, Registration, ViewGraph
 from hodge_pipeline.uses.trajectory import refine_trajectory

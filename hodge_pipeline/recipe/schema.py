@@ -18,8 +18,8 @@ from hodge_pipeline.pairs.held_out import GuardOptions
 from hodge_pipeline.recipe import binding, recipe_file
 from hodge_pipeline.recipe.recording_options import RecordingOptions
 from hodge_pipeline.recipe.round_options import SolveWith, SuggestionOptions
+from hodge_pipeline.registration.acceptance import Acceptance
 from hodge_pipeline.registration.clouds import CloudOptions
-from hodge_pipeline.registration.pairs import Acceptance
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.sources.measured_edges import MeasuredOptions
 from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Executor, FrameReader, Fuser, Registrar, Start

@@ -8,8 +8,8 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.recipe import binding, recipe_file
+from hodge_pipeline.registration.acceptance import Acceptance
 from hodge_pipeline.registration.clouds import CloudOptions
-from hodge_pipeline.registration.pairs import Acceptance
 from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Executor, ModelReader, Registrar
 
 OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)

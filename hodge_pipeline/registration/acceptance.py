@@ -3,15 +3,59 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.registration.assessment import SAME_FITNESS
 from hodge_pipeline.registration.odometry_path import contradicts_odometry, without_slides
-from hodge_pipeline.registration.pairs import Acceptance
+from hodge_pipeline.registration.sliding import consecutive, weak_directions
 from hodge_pipeline.scene import Drift
 from hodge_pipeline.types import Edges, Ints
 from hodge_pipeline.types.edges import HELD_OUT, REGISTERED, REJECTED, USED
 
 CONTRADICTS = "contradicts odometry"
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Acceptance:
+    """Which registered pairs become edges; the others are counted and listed with the reason."""
+
+    min_fitness: float = Field(
+        default=0.3,
+        ge=0,
+        le=1,
+        description="share of cloud j with a point of cloud i nearby; below it too little holds the pair",
+    )
+    max_rmse_m: float | None = Field(
+        default=0.06,
+        gt=0,
+        description="metres: RMS distance of those points; two 3 cm grids of one surface differ by 2 to 4 cm. "
+        "null: any",
+    )
+    min_spread: float = Field(
+        default=0.02,
+        ge=0,
+        le=0.3,
+        description="share of a pair's information on translation that its weakest direction has, at most a third; "
+        "below it what both see, such as a bare floor or wall, lets them slide on each other wherever the guess is "
+        "wrong. 0.02: normals within 8° of each other. Consecutive frames, and all below twice that, "
+        "stay at their guess in such a direction",
+    )
+
+    def reasons(self, registered: Edges, in_order: bool = True) -> NDArray[np.str_]:
+        """Why each pair (P,) is rejected by itself, an empty word where it is accepted.
+
+        Steps of frames that are `in_order` may slide: they stay at their guess.
+        """
+        out = np.full(len(registered.pairs), "", "U64")
+        weak, _ = weak_directions(registered, self.min_spread)
+        out[weak.any(axis=1) & ~(in_order & consecutive(registered))] = "what they share lets them slide"
+        if self.max_rmse_m is not None:
+            out[~(registered.rmse_m <= self.max_rmse_m)] = "points too far apart"
+        out[~(registered.fitness >= self.min_fitness)] = "too little overlap"
+        out[registered.correspondences == 0] = "nothing in common"
+        return out
 
 
 def accepted(edges: Edges, acceptance: Acceptance, drift: Drift | None, in_order: bool = True) -> tuple[Edges, Ints]:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from hodge_pipeline.registration.resection import back_project
-from hodge_pipeline.types import Bools, Bytes, Camera, Floats, Floats32, Frame, Ints, Landmarks
+from hodge_pipeline.registration.pixels import back_project, sound_depth
+from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame, Landmarks
 
-EDGE_STEP = 0.03
-"""Share of its depth by which the 3x3 pixels of a landmark differ at most: others lie on an edge."""
 WIDE_PX, SHRUNK = 640, 0.7
 """An image at least so wide is shrunk first: SIFT begins with it doubled, and finds the finest features where a pixel's
 noise is largest. Less than half the time, and smaller errors in four of six videos (fr1/xyz and one of the rendered
@@ -62,16 +60,3 @@ def _features(grey: Bytes, depth_shape: tuple[int, ...], count: int, contrast: f
     strongest = np.argsort([-point.response for point in found], kind="stable")[:count]
     pixels = (np.array([found[row].pt for row in strongest]) + 0.5) * larger - 0.5
     return pixels, np.asarray(descriptors)[strongest].astype(np.uint8)
-
-
-def sound_depth(depth: Floats32, pixels: Ints, min_range_m: float, max_range_m: float) -> tuple[Floats32, Bools]:
-    """The median depth (n,) of the 3x3 pixels around each, and where it is in range and not on an edge."""
-    height, width = depth.shape
-    steps = np.array([(dv, du) for dv in (-1, 0, 1) for du in (-1, 0, 1)])
-    v = np.clip(pixels[:, 1, None] + steps[:, 0], 0, height - 1)
-    u = np.clip(pixels[:, 0, None] + steps[:, 1], 0, width - 1)
-    window = depth[v, u]
-    middle = np.median(window, axis=1)
-    in_range = (window.min(axis=1) >= min_range_m) & (window.max(axis=1) <= max_range_m)
-    flat = window.max(axis=1) - window.min(axis=1) <= EDGE_STEP * middle
-    return middle.astype(np.float32), np.asarray(in_range & flat)

@@ -14,8 +14,8 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.flow import Corners, FlowImage, Followed, find_corners, follow
-from hodge_pipeline.registration.resection import DEPTH_SIGMAS, GATE_PX, PIXEL_SIGMA, back_project, project
-from hodge_pipeline.registration.visual import depth_sigma
+from hodge_pipeline.registration.pixels import DEPTH_SIGMAS, PIXEL_SIGMA, back_project, depth_sigma, project
+from hodge_pipeline.registration.resection import GATE_PX
 from hodge_pipeline.types import Bytes, Floats, Floats32, Ints
 
 CELLS = 80

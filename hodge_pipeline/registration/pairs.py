@@ -10,98 +10,16 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
-from pydantic.dataclasses import dataclass
 
-from hodge_pipeline import se3
 from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
-from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
 from hodge_pipeline.types.edges import REGISTERED, USED
 
 PAIRS_IN_BLOCK = 64
 """About half a second: long against sending a block, short enough to share the work and to lose little of it."""
 CLOUDS_KEPT = 32
 """Prepared clouds that a worker keeps, 2 to 4 MB each."""
-
-HELD_SPREADS = 2.0
-"""Times `Acceptance.min_spread`: below it noise of the normals may feign a constraint. In a bare tunnel at 16 beams,
-where GICP slides by whole steps of 1.4 m, the weakest direction has 0.018 to 0.028; 95 % of pairs in a street have
-0.04."""
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Acceptance:
-    """Which registered pairs become edges; the others are counted and listed with the reason."""
-
-    min_fitness: float = Field(
-        default=0.3,
-        ge=0,
-        le=1,
-        description="share of cloud j with a point of cloud i nearby; below it too little holds the pair",
-    )
-    max_rmse_m: float | None = Field(
-        default=0.06,
-        gt=0,
-        description="metres: RMS distance of those points; two 3 cm grids of one surface differ by 2 to 4 cm. "
-        "null: any",
-    )
-    min_spread: float = Field(
-        default=0.02,
-        ge=0,
-        le=0.3,
-        description="share of a pair's information on translation that its weakest direction has, at most a third; "
-        "below it what both see, such as a bare floor or wall, lets them slide on each other wherever the guess is "
-        "wrong. 0.02: normals within 8° of each other. Consecutive frames, and all below twice that, "
-        "stay at their guess in such a direction",
-    )
-
-    def reasons(self, registered: Edges, in_order: bool = True) -> NDArray[np.str_]:
-        """Why each pair (P,) is rejected by itself, an empty word where it is accepted.
-
-        Steps of frames that are `in_order` may slide: they stay at their guess.
-        """
-        out = np.full(len(registered.pairs), "", "U64")
-        weak, _ = weak_directions(registered, self.min_spread)
-        out[weak.any(axis=1) & ~(in_order & _consecutive(registered))] = "what they share lets them slide"
-        if self.max_rmse_m is not None:
-            out[~(registered.rmse_m <= self.max_rmse_m)] = "points too far apart"
-        out[~(registered.fitness >= self.min_fitness)] = "too little overlap"
-        out[registered.correspondences == 0] = "nothing in common"
-        return out
-
-
-def unheld_steps(edges: Edges, min_spread: float) -> Bools:
-    """Where (P,) consecutive frames leave a direction of translation unconstrained, as before a bare wall."""
-    weak, _ = weak_directions(edges, HELD_SPREADS * min_spread)
-    return np.asarray(weak.any(axis=1) & _consecutive(edges))
-
-
-def held_where_sliding(registered: Edges, guesses: Floats, min_spread: float) -> Edges:
-    """The table with translations kept at their guesses `i_from_j (P, 4, 4)` along directions in which the surfaces may
-    slide (solution remapping, Zhang et al., ICRA 2016).
-    """
-    weak, directions = weak_directions(registered, HELD_SPREADS * min_spread)
-    rows = np.flatnonzero(weak.any(axis=1))
-    if not len(rows):
-        return registered
-    twist = se3.log(se3.inverse(guesses[rows]) @ registered.i_from_j[rows])
-    slid = np.einsum("nik,nk,njk,nj->ni", directions[rows], weak[rows].astype(float), directions[rows], twist[:, 3:])
-    twist[:, 3:] -= slid
-    iterations = np.maximum(registered.iterations[rows], 1)
-    return registered.put(rows, i_from_j=guesses[rows] @ se3.exp(twist), iterations=iterations)
-
-
-def weak_directions(registered: Edges, min_spread: float) -> tuple[Bools, Floats]:
-    """Which directions (P, 3) hardly constrain translation, and the directions as columns (P, 3, 3), in j's axes."""
-    values, vectors = np.linalg.eigh(np.nan_to_num(registered.information[:, 3:, 3:]))
-    return np.asarray(np.maximum(values, 0.0) < min_spread * values.sum(axis=1, keepdims=True)), vectors
-
-
-def _consecutive(registered: Edges) -> Bools:
-    rank = np.searchsorted(np.unique(registered.pairs), registered.pairs)
-    return np.asarray(np.abs(rank[:, 0] - rank[:, 1]) == 1)
 
 
 def register_pairs(

@@ -10,7 +10,8 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.gicp import Gicp
-from hodge_pipeline.registration.pairs import HELD_SPREADS, held_where_sliding, register_pairs, weak_directions
+from hodge_pipeline.registration.pairs import register_pairs
+from hodge_pipeline.registration.sliding import HELD_SPREADS, held_where_sliding, weak_directions
 from hodge_pipeline.stages import Registrar, Step, Workers
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.resection import back_project, project, resect
+from hodge_pipeline.registration.pixels import back_project, project
+from hodge_pipeline.registration.resection import resect
 from hodge_pipeline.registration.shutter import at_frame_stamp
 from hodge_pipeline.registration.sightings import Sightings, View
 from hodge_pipeline.store import artifacts

@@ -11,13 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.visual import depth_sigma
+from hodge_pipeline.registration.pixels import DEPTH_SIGMAS, PIXEL_SIGMA, depth_sigma, project
 from hodge_pipeline.types import Bools, Camera, Floats
 
-PIXEL_SIGMA = 0.75
-"""Pixels: of a corner followed by optical flow, on TUM fr1."""
-DEPTH_SIGMAS = 2.0
-"""Factor on `depth_sigma`, the noise of one pixel on a plane: corners lie where depth is worst."""
 GATE_PX = 4.0
 """Reprojection error in pixels of an inlier, at most; depths are gated at as many sigmas."""
 ANNEALED = (8.0, 4.0, 2.0, 1.0, 1.0, 1.0, 1.0)
@@ -33,20 +29,6 @@ class Resection:
     known_from_cam: Floats
     information: Floats
     inliers: Bools
-
-
-def project(points_in_cam: Floats, camera: Camera) -> Floats:
-    """Columns u, v, z (n, 3) of points (n, 3): pixels and metres; not finite where a point is not before the camera."""
-    z = np.where(points_in_cam[:, 2] > 0, points_in_cam[:, 2], np.nan)
-    u = camera.fx * points_in_cam[:, 0] / z + camera.cx
-    v = camera.fy * points_in_cam[:, 1] / z + camera.cy
-    return np.stack([u, v, z], axis=1)
-
-
-def back_project(seen: Floats, camera: Camera) -> Floats:
-    """Points (n, 3) in the camera's axes of columns u, v, z (n, 3)."""
-    z = seen[:, 2]
-    return np.stack([(seen[:, 0] - camera.cx) / camera.fx * z, (seen[:, 1] - camera.cy) / camera.fy * z, z], axis=1)
 
 
 def resect(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.resection import project
+from hodge_pipeline.registration.pixels import project
 from hodge_pipeline.types import Bools, Camera, Floats, Ints
 
 LONGEST_SPAN_S = 0.5

@@ -12,16 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.registration.pixels import DEPTH_SIGMAS, PIXEL_SIGMA, depth_sigma
 from hodge_pipeline.types import Bools, Floats
 
 TRIPLES = 300
 """Of matches, drawn at random: where 30 % are right, no triple is in 0.03 % of pairs."""
 FEWEST_MATCHES = 8
 """As many agree by chance in unrelated frames: see `Rgbd.min_inliers`."""
-PIXEL_SIGMA = 0.75
-"""Pixels: a feature's own error, once the shutter's is taken out, on TUM fr1."""
-DEPTH_SIGMAS = 2.0
-"""Factor on `depth_sigma`, the noise of one pixel on a plane: features lie where depth is worst."""
 GATE = 3.0
 """Standard deviations of an inlier, at most, in each of three axes."""
 GATE_PIXEL_SIGMA = 1.5
@@ -39,11 +36,6 @@ class VisualMotion:
     information: Floats
     inliers: int
     matches: int
-
-
-def depth_sigma(z_m: Floats) -> Floats:
-    """Standard deviation in metres of a structured-light depth (Nguyen, Izadi and Lovell 2012, axial noise)."""
-    return np.asarray(0.0012 + 0.0019 * (z_m - 0.4) ** 2)
 
 
 def covariances(points: Floats, pixel_sigma_rad: Floats, depth_sigmas: float) -> Floats:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hodge_pipeline.complex.components import in_runs
 from hodge_pipeline.diagnosis.result import UNTESTABLE, VERDICTS, WRONG
 from hodge_pipeline.evaluation.trajectory import AbsoluteError, RelativeError, absolute_error, relative_error
-from hodge_pipeline.registration.pairs import unheld_steps
+from hodge_pipeline.registration.sliding import unheld_steps
 from hodge_pipeline.report.contents import ComponentRow, EdgeRow, GraphSummary, TrajectoryRow, WrongEdges
 from hodge_pipeline.scene import Round
 from hodge_pipeline.stages import ConsistencySolver, Step

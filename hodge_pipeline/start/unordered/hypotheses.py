@@ -14,7 +14,8 @@ from hodge_pipeline import se3
 from hodge_pipeline.registration.colour_evidence import hue_conflicts
 from hodge_pipeline.registration.global_evidence import DepthView, violation
 from hodge_pipeline.registration.global_pairs import Matches
-from hodge_pipeline.registration.pairs import register_pairs, weak_directions
+from hodge_pipeline.registration.pairs import register_pairs
+from hodge_pipeline.registration.sliding import weak_directions
 from hodge_pipeline.stages import Registrar, Workers
 from hodge_pipeline.start.unordered.options import HypothesisLimits
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints
