@@ -235,7 +235,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(address: str, monkeypatch: py
 
 
 def test_workers_of_tracking_pairs_and_scores_load_no_scipy() -> None:
-    tasks = "registration.tracking, hodge_pipeline.registration.rgbd, hodge_pipeline.evaluation.cloud_distance"
+    tasks = "registration.tracking.tracker, hodge_pipeline.registration.rgbd, hodge_pipeline.evaluation.cloud_distance"
     code = f"import sys, hodge_pipeline.{tasks}\nprint({{'scipy', 'open3d', 'matplotlib', 'rerun'}} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

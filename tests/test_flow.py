@@ -9,13 +9,13 @@ import pytest
 from hodge_adapters.tum.reader import READOUT_S, TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
-from hodge_pipeline.registration.flow import Corners, FlowImage, find_corners, flow_image, follow
 from hodge_pipeline.registration.pixels import back_project, project
-from hodge_pipeline.registration.readout import estimate_readout, with_readout
-from hodge_pipeline.registration.reposing import PosedBlock, repose
-from hodge_pipeline.registration.resection import resect
-from hodge_pipeline.registration.shutter import at_frame_stamp, velocities
-from hodge_pipeline.registration.sightings import Sightings
+from hodge_pipeline.registration.tracking.flow import Corners, FlowImage, find_corners, flow_image, follow
+from hodge_pipeline.registration.tracking.readout import estimate_readout, with_readout
+from hodge_pipeline.registration.tracking.reposing import PosedBlock, repose
+from hodge_pipeline.registration.tracking.resection import resect
+from hodge_pipeline.registration.tracking.shutter import at_frame_stamp, velocities
+from hodge_pipeline.registration.tracking.sightings import Sightings
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Camera, Floats, Frame, Source
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hodge_pipeline.registration.focal import estimate_focal
-from hodge_pipeline.registration.sightings import Sightings
+from hodge_pipeline.registration.tracking.focal import estimate_focal
+from hodge_pipeline.registration.tracking.sightings import Sightings
 from hodge_pipeline.store import artifacts
 from test_flow import CAMERA, frames_of, shaken_views
 

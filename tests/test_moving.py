@@ -15,10 +15,10 @@ from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.executors.local import InProcess
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration import tracking
-from hodge_pipeline.registration.flow import find_corners, flow_image, follow
-from hodge_pipeline.registration.moving import MUCH, Moments, contradicting, misplaced, rival_motion
-from hodge_pipeline.registration.sightings import Sightings
-from hodge_pipeline.registration.tracked_frame import TrackedFrame
+from hodge_pipeline.registration.tracking.flow import find_corners, flow_image, follow
+from hodge_pipeline.registration.tracking.frame import TrackedFrame
+from hodge_pipeline.registration.tracking.moving import MUCH, Moments, contradicting, misplaced, rival_motion
+from hodge_pipeline.registration.tracking.sightings import Sightings
 from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.start.key_frames import KeyFrameStart, Tracked, track
 from hodge_pipeline.store import artifacts

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.smoothing import smoothed
+from hodge_pipeline.registration.tracking.smoothing import smoothed
 from hodge_pipeline.rounds.all_frames import _smooth
 from hodge_pipeline.scene import KeyFrames
 from hodge_pipeline.types import Floats

@@ -24,10 +24,10 @@ from hodge_pipeline.fusion.fuse import fuse_all
 from hodge_pipeline.pairs.edits import Edit, History, write_history
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.registration import tracking
-from hodge_pipeline.registration.focal import Focal
-from hodge_pipeline.registration.readout import Readout
-from hodge_pipeline.registration.tracked_blocks import TrackedBlocks
-from hodge_pipeline.registration.tracking import TrackingOptions, frame_blocks, track_block
+from hodge_pipeline.registration.tracking.blocks import TrackedBlocks
+from hodge_pipeline.registration.tracking.focal import Focal
+from hodge_pipeline.registration.tracking.readout import Readout
+from hodge_pipeline.registration.tracking.tracker import TrackingOptions, frame_blocks, track_block
 from hodge_pipeline.rounds.all_frames import pose_frames
 from hodge_pipeline.scene import Scene, key_source
 from hodge_pipeline.stages import Step, no_progress

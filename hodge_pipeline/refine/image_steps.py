@@ -10,7 +10,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.registration.flow import FlowImage, find_corners, flow_image, follow
+from hodge_pipeline.registration.tracking.flow import FlowImage, find_corners, flow_image, follow
 from hodge_pipeline.stages import Step
 from hodge_pipeline.types import Floats, Frame, Ints, Source
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline.complex.components import in_runs
-from hodge_pipeline.registration.readout import with_readout
-from hodge_pipeline.registration.reposing import PosedBlock, repose_stored
-from hodge_pipeline.registration.shutter import LONGEST_SPAN_S, velocities
-from hodge_pipeline.registration.smoothing import VIDEO_STEP_S, smoothed
+from hodge_pipeline.registration.tracking.readout import with_readout
+from hodge_pipeline.registration.tracking.reposing import PosedBlock, repose_stored
+from hodge_pipeline.registration.tracking.shutter import LONGEST_SPAN_S, velocities
+from hodge_pipeline.registration.tracking.smoothing import VIDEO_STEP_S, smoothed
 from hodge_pipeline.scene import KeyFrames, Scene, stamps_of, vertex_ids
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.types import Floats, Source

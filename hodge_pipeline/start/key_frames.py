@@ -13,18 +13,18 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.complex.components import connected_components, in_runs
-from hodge_pipeline.registration.bridging import bridge
 from hodge_pipeline.registration.cloud_set import no_clouds
 from hodge_pipeline.registration.clouds import CloudOptions
-from hodge_pipeline.registration.focal import estimate_focal
 from hodge_pipeline.registration.gaps import told_gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chained
-from hodge_pipeline.registration.readout import estimate_readout, with_readout
-from hodge_pipeline.registration.repeats import find_repeats
-from hodge_pipeline.registration.shutter import at_frame_stamp, velocities
-from hodge_pipeline.registration.smoothing import VIDEO_STEP_S
-from hodge_pipeline.registration.tracked_blocks import BlockRows, TrackedBlocks
-from hodge_pipeline.registration.tracking import FrameBlock, TrackingOptions, frame_blocks, track_block
+from hodge_pipeline.registration.tracking.blocks import BlockRows, TrackedBlocks
+from hodge_pipeline.registration.tracking.bridging import bridge
+from hodge_pipeline.registration.tracking.focal import estimate_focal
+from hodge_pipeline.registration.tracking.readout import estimate_readout, with_readout
+from hodge_pipeline.registration.tracking.repeats import find_repeats
+from hodge_pipeline.registration.tracking.shutter import at_frame_stamp, velocities
+from hodge_pipeline.registration.tracking.smoothing import VIDEO_STEP_S
+from hodge_pipeline.registration.tracking.tracker import FrameBlock, TrackingOptions, frame_blocks, track_block
 from hodge_pipeline.scene import (
     KeyFrames,
     Scene,

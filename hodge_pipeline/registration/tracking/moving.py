@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.flow import Corners, FlowImage, Followed, find_corners, follow
 from hodge_pipeline.registration.pixels import DEPTH_SIGMAS, PIXEL_SIGMA, back_project, depth_sigma, project
-from hodge_pipeline.registration.resection import GATE_PX
+from hodge_pipeline.registration.tracking.flow import Corners, FlowImage, Followed, find_corners, follow
+from hodge_pipeline.registration.tracking.resection import GATE_PX
 from hodge_pipeline.types import Bytes, Floats, Floats32, Ints
 
 CELLS = 80

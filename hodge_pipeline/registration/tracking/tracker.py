@@ -14,12 +14,12 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.clouds import CloudOptions
-from hodge_pipeline.registration.flow import Followed, follow
-from hodge_pipeline.registration.moving import AT_REST, Moments, contradicting, misplaced, rival_motion
 from hodge_pipeline.registration.odometry import SURE_FITNESS, OdometryOptions
-from hodge_pipeline.registration.sightings import Sightings
-from hodge_pipeline.registration.tracked_blocks import TrackedBlock
-from hodge_pipeline.registration.tracked_frame import FEWEST_FOLLOWED, TrackedFrame
+from hodge_pipeline.registration.tracking.blocks import TrackedBlock
+from hodge_pipeline.registration.tracking.flow import Followed, follow
+from hodge_pipeline.registration.tracking.frame import FEWEST_FOLLOWED, TrackedFrame
+from hodge_pipeline.registration.tracking.moving import AT_REST, Moments, contradicting, misplaced, rival_motion
+from hodge_pipeline.registration.tracking.sightings import Sightings
 from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.types import Edges, Floats, Frame, Ints, PointCloud, Registration
 

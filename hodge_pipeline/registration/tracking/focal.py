@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.readout import FEWEST_KEYS, INTERVAL, drawn_keys, with_readout
-from hodge_pipeline.registration.reposing import view_at_stamps
-from hodge_pipeline.registration.resection import focal_evidence, resect
-from hodge_pipeline.registration.sightings import views
+from hodge_pipeline.registration.tracking.readout import FEWEST_KEYS, INTERVAL, drawn_keys, with_readout
+from hodge_pipeline.registration.tracking.reposing import view_at_stamps
+from hodge_pipeline.registration.tracking.resection import focal_evidence, resect
+from hodge_pipeline.registration.tracking.sightings import views
 from hodge_pipeline.types import Camera, Floats, Frame
 from hodge_pipeline.types.arrays import evenly, groups
 

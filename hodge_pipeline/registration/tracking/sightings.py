@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_pipeline.registration.flow import Followed
+from hodge_pipeline.registration.tracking.flow import Followed
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Floats, Ints
 from hodge_pipeline.types.arrays import evenly, groups

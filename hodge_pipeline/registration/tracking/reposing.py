@@ -10,9 +10,9 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.pixels import back_project, project
-from hodge_pipeline.registration.resection import resect
-from hodge_pipeline.registration.shutter import at_frame_stamp
-from hodge_pipeline.registration.sightings import Sightings, View
+from hodge_pipeline.registration.tracking.resection import resect
+from hodge_pipeline.registration.tracking.shutter import at_frame_stamp
+from hodge_pipeline.registration.tracking.sightings import Sightings, View
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Bools, Camera, Floats, Frame, Ints
 from hodge_pipeline.types.arrays import groups

@@ -15,7 +15,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.pixels import back_project, project, sound_depth
-from hodge_pipeline.registration.resection import Resection, resect
+from hodge_pipeline.registration.tracking.resection import Resection, resect
 from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame
 
 CORNERS = 300

@@ -10,7 +10,7 @@ import numpy as np
 
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.registration.clouds import CloudOptions, cloud_or_note, is_blank
-from hodge_pipeline.registration.flow import Corners, FlowImage, find_corners, flow_image
+from hodge_pipeline.registration.tracking.flow import Corners, FlowImage, find_corners, flow_image
 from hodge_pipeline.stages import Registrar
 from hodge_pipeline.types import Bytes, Floats, Frame, PointCloud
 

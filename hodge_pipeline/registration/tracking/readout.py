@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.registration.reposing import view_at_stamps
-from hodge_pipeline.registration.resection import resect, robust_cost
-from hodge_pipeline.registration.sightings import View, views
+from hodge_pipeline.registration.tracking.reposing import view_at_stamps
+from hodge_pipeline.registration.tracking.resection import resect, robust_cost
+from hodge_pipeline.registration.tracking.sightings import View, views
 from hodge_pipeline.types import Camera, Floats, Frame, Ints
 from hodge_pipeline.types.arrays import evenly, groups
 

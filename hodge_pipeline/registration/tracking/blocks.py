@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_pipeline.registration.sightings import Sightings
+from hodge_pipeline.registration.tracking.sightings import Sightings
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, PointCloud, Words
 
