@@ -106,7 +106,7 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
 def draw_once(patch: pytest.MonkeyPatch, folder: Path) -> None:
     """Keep the first plot, and the first pictures of a scene, of each kind of data for all that come later."""
-    from hodge_pipeline.report import diagnosis_plots, edge_pictures, painting, plots, run_report
+    from hodge_pipeline.report import diagnosis_plots, edge_pictures, error_plots, painting, plots, run_report
     from hodge_pipeline.report.document import Picture
 
     paint_it = painting.painted
@@ -121,7 +121,7 @@ def draw_once(patch: pytest.MonkeyPatch, folder: Path) -> None:
 
         return shown
 
-    for module in (diagnosis_plots, edge_pictures, painting, plots):
+    for module in (diagnosis_plots, edge_pictures, error_plots, plots):
         patch.setattr(module, "painted", painted)
     for show in (run_report.changed_most, run_report.four_sides):
         patch.setattr(run_report, show.__name__, seen(show))

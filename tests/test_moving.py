@@ -14,7 +14,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.executors.local import InProcess
 from hodge_pipeline.recipe.schema import load_recipe
-from hodge_pipeline.registration import tracking
+from hodge_pipeline.registration.tracking import tracker
 from hodge_pipeline.registration.tracking.flow import find_corners, flow_image, follow
 from hodge_pipeline.registration.tracking.frame import TrackedFrame
 from hodge_pipeline.registration.tracking.moving import MUCH, Moments, contradicting, misplaced, rival_motion
@@ -114,10 +114,10 @@ def test_depth_and_colour_of_different_moments_are_no_object_before_a_camera_tha
         return told(key, view, motion), told(key, view, motion, Moments(twists[0], twists[1]))
 
     by_itself, with_twists = shares(swept)
-    assert by_itself > tracking.DOUBTFUL and with_twists < 0.05
-    assert shares(with_block(swept, 0.4))[1] > tracking.DOUBTFUL
+    assert by_itself > tracker.DOUBTFUL and with_twists < 0.05
+    assert shares(with_block(swept, 0.4))[1] > tracker.DOUBTFUL
     by_itself, with_twists = shares(swept, misplaced, 4)
-    assert by_itself > tracking.MISPLACED and with_twists < MUCH
+    assert by_itself > tracker.MISPLACED and with_twists < MUCH
 
 
 def test_stamps_that_err_take_no_frame_from_the_flow(tmp_path: Path) -> None:

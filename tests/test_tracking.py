@@ -23,7 +23,7 @@ from hodge_pipeline.fusion.cloud import CloudFuser
 from hodge_pipeline.fusion.fuse import fuse_all
 from hodge_pipeline.pairs.edits import Edit, History, write_history
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
-from hodge_pipeline.registration import tracking
+from hodge_pipeline.registration.tracking import tracker
 from hodge_pipeline.registration.tracking.blocks import TrackedBlocks
 from hodge_pipeline.registration.tracking.focal import Focal
 from hodge_pipeline.registration.tracking.readout import Readout
@@ -52,7 +52,7 @@ SMALL = (
 def short_blocks() -> Iterator[None]:
     """Two blocks of these sequences."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tracking, "FRAMES_IN_BLOCK", BLOCK)
+        patch.setattr(tracker, "FRAMES_IN_BLOCK", BLOCK)
         yield
 
 
