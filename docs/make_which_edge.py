@@ -1,6 +1,6 @@
 """Does what docs/which-edge.md walks through, and draws its pictures: `python docs/make_which_edge.py runs/which-edge`.
 
-With `--loops FILE` it writes the file of loop closures alone, three of them wrong.
+With `--loops FILE` it writes the file of loop closures alone, three of them wrong, and prints the sequence's folder.
 """
 
 from __future__ import annotations
@@ -116,6 +116,8 @@ if __name__ == "__main__":
     parser.add_argument("--loops", type=Path, help="write the loop closures here and do nothing else")
     chosen = parser.parse_args()
     if chosen.loops:
-        write_loops(chosen.loops, demo_source(DemoOptions()))
+        source = demo_source(DemoOptions())
+        write_loops(chosen.loops, source)
+        print(source)
     else:
         main(chosen.folder)

@@ -209,7 +209,7 @@ def large_graph() -> ViewGraph:
         (lambda: Edges.of([]), "Edges(0 pairs)"),
         (
             lambda: hodge_pipeline.solve(large_graph()),
-            "Solution(3000 poses in 1 components, 2999 of 2999 edges count)",
+            "Solution(3000 poses in 1 component, 2999 of 2999 edges count)",
         ),
         (lambda: hodge_pipeline.diagnose(large_graph()), "Diagnosis(2999 edges: 0 consistent, 0 suspect, 0 wrong,"),
         (lambda: large_run().clouds, "CloudSet(3000 clouds, 6000 points)"),

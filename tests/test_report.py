@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M
@@ -23,6 +24,7 @@ from hodge_pipeline.report.contents import (
     SourceSummary,
     StageRow,
 )
+from hodge_pipeline.report.plots import _residuals
 from hodge_pipeline.report.run_page import document
 from hodge_pipeline.report.summary import graph_summary, in_runs, trajectory_rows
 from hodge_pipeline.report.suspicions import suspicions
@@ -121,6 +123,18 @@ def test_what_nobody_measured_has_no_column_and_no_number(report: Report) -> Non
     assert {"fitness", "verdict"} <= set(table.header) and {len(row) for row in table.rows} == {8}
     solved = replace(report, stages=(StageRow("solve", 1.0, 2.0, float("nan")),))
     assert "nan" not in str(stages_table(solved)) and "time     1.0 s, 2.0 CPU s" in brief(solved, "x")
+
+
+def test_a_caption_says_what_the_words_of_its_table_mean(report: Report) -> None:
+    caption = next(table for table in score_tables(report) if table.title == "Scores").caption
+    assert "centroids lie less than 20 cm apart" in caption or "voxels of 10 cm" in caption
+    judged = replace(report.worst_edges[0], why="it agrees with the backbone and 9 other loops")
+    assert "Backbone: " in worst_edges_table(replace(report, worst_edges=(judged,))).caption
+    assert "Backbone: " not in worst_edges_table(report).caption
+    figure = Figure()
+    _residuals(figure, report)
+    told = [text.get_text() for axes in figure.axes for text in axes.get_legend().get_texts()]
+    assert "median" in told[0] and all(text.endswith((" cm", "°")) for text in told if "median" in text)
 
 
 def test_a_refinement_that_is_not_kept_is_not_called_the_result(report: Report) -> None:

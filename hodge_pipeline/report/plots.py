@@ -65,7 +65,11 @@ def _plots(report: Report) -> Iterator[Picture]:
         yield painted("Trajectory from above", caption, lambda figure: _paths(figure, report))
     yield from error_plots(report)
     if report.scores is not None and any(len(graph.pairs) for graph in report.scores.graphs):
-        yield painted("Score of each pair", "Further right is better.", lambda figure: _score_histogram(figure, report))
+        yield painted(
+            "Score of each pair",
+            "How well the two clouds of a pair fit: further right is better, 1 is perfect (Scores).",
+            lambda figure: _score_histogram(figure, report),
+        )
     if any(len(residuals.translation_m) for residuals in pictures.residuals):
         least = f"what is below {SMALLEST_RESIDUAL} is drawn as that"
         caption = f"Measured motions against the poses: further left is better; {least}."
@@ -126,17 +130,18 @@ def _score_histogram(figure: Figure, report: Report) -> None:
 
 def _residuals(figure: Figure, report: Report) -> None:
     unit, factor = _small_unit(report)
-    for axes, name, columns in zip(
+    for axes, name, name_unit, columns in zip(
         figure.subplots(2, 1),
-        (f"residual translation, {unit}", "residual rotation, °"),
+        ("translation", "rotation"),
+        (f" {unit}", "°"),
         (
             [(r.name, r.translation_m * factor) for r in report.pictures.residuals],
             [(r.name, np.rad2deg(r.angle_rad)) for r in report.pictures.residuals],
         ),
         strict=True,
     ):
-        _log_histogram(axes, report, columns)
-        axes.set_xlabel(name)
+        _log_histogram(axes, report, columns, name_unit)
+        axes.set_xlabel(f"residual {name}, {name_unit.strip()}")
         _count(axes, "edges")
         _legend_above(axes)
 
@@ -151,13 +156,13 @@ def _small_unit(report: Report) -> tuple[str, float]:
     return ("cm", 100.0) if report.has_metres else (UNKNOWN_UNIT, 1.0)
 
 
-def _log_histogram(axes: Any, report: Report, columns: list[tuple[str, Floats]]) -> None:
+def _log_histogram(axes: Any, report: Report, columns: list[tuple[str, Floats]], unit: str) -> None:
     known = [(name, values[np.isfinite(values)]) for name, values in columns]
     every = np.concatenate([values for _, values in known if len(values)] or [np.zeros(1)]).clip(SMALLEST_RESIDUAL)
     low, high = np.floor(np.log10(every.min())), np.ceil(np.log10(1.001 * every.max()))
     bins = np.geomspace(10**low, 10**high, HISTOGRAM_BINS)
     for name, values in known:
-        median = f", median {np.median(values):.2g}" if len(values) else ""
+        median = f", median {np.median(values):.2g}{unit}" if len(values) else ""
         shown = values.clip(SMALLEST_RESIDUAL)
         axes.hist(shown, bins=bins, histtype="step", label=f"{name}{median}", **_style(report, name))
     axes.set_xscale("log")

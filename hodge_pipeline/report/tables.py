@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from hodge_pipeline.evaluation.difference import length
-from hodge_pipeline.evaluation.scores import SIGMA_M, GraphScores
+from hodge_pipeline.evaluation.scores import CENTROID_DISTANCE_M, IOU, IOU_VOXEL_M, SIGMA_M, GraphScores
 from hodge_pipeline.report import known_positions
 from hodge_pipeline.report.contents import GRAPH_NAMES, RefinementSummary, Report
 from hodge_pipeline.report.document import Table
@@ -95,6 +95,7 @@ def _scores(report: Report) -> Table:
     caption = _of_key_frames(report) + (
         f"How well overlapping clouds lie on each other, on the pairs of the {table.reference} poses ({counts}). "
         f"d: mean point-to-plane distance; score: mean of exp(−d / {table.scale * SIGMA_M * 1000:g} mm), 1 is perfect. "
+        f"{' '.join(_kind_of_pairs(graph, table.scale) for graph in table.graphs)} "
         "Compare rows with each other: a score has no meaning alone."
     )
     return Table(
@@ -104,6 +105,13 @@ def _scores(report: Report) -> Table:
         caption,
         highlighted=report.after,
     )
+
+
+def _kind_of_pairs(graph: GraphScores, scale: float) -> str:
+    """Which pairs a graph has, in a sentence."""
+    if graph.kind == "distance":
+        return f"Near-centroid pairs: clouds whose centroids lie less than {length(scale * CENTROID_DISTANCE_M)} apart."
+    return f"Overlapping pairs: more than {IOU:.0%} of the voxels of both ({length(scale * IOU_VOXEL_M)}) are shared."
 
 
 def counted_pairs(graph: GraphScores) -> str:
@@ -155,7 +163,8 @@ def _graph(report: Report) -> Table:
         ("connected parts", str(len(graph.components))),
         *((f"pairs rejected: {reason}", str(count)) for reason, count in graph.rejected.items()),
     ]
-    return Table("Viewing graph", ("what", "count"), tuple(rows), "An edge is a measured motion between two frames.")
+    caption = "An edge is a measured motion between two frames; the word after `edges:` says what proposed the pair."
+    return Table("Viewing graph", ("what", "count"), tuple(rows), caption)
 
 
 def _energies(report: Report) -> Table:
@@ -164,7 +173,8 @@ def _energies(report: Report) -> Table:
         for name, row in report.energies.items()
     )
     caption = (
-        "Helmholtz–Hodge parts of ω = log(T_i Z_ij T_j⁻¹) before the solve of each round: shares of the energy of "
+        "What the edges say beyond the poses before each round's solve, "
+        "ω = log(world_from_i · i_from_j · j_from_world), in Helmholtz–Hodge parts: shares of the energy, "
         "rotation / translation. Exact: what moving the poses takes away; co-exact: triangles that do not close; "
         "harmonic: longer loops that do not."
     )
@@ -213,8 +223,11 @@ def worst_edges_table(report: Report) -> Table:
     told = {
         "fitness": " Fitness: share of the cloud that found a partner.",
         "weight": " Weight: 0 where the solver ignored the edge.",
+        "source": " Source: what proposed the pair.",
         "verdict": " Verdict: what the cycles through the edge say.",
     }
+    if any("backbone" in edge.why for edge in edges):
+        told["why"] = " Backbone: consecutive edges that are trusted as a whole, as an odometry."
     header = tuple(name for name, cells in columns.items() if set(cells) != {"–"})
     rows = tuple(zip(*(columns[name] for name in header), strict=True))
     caption = "Measured motions that disagree most with the result, worst first: a wrong edge, or a wrong result there."

@@ -24,6 +24,7 @@ from hodge_pipeline.types.edges import Registration as Registration
 from hodge_pipeline.types.edges import ViewGraph as ViewGraph
 from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.positions import Positions as Positions
+from hodge_pipeline.types.text import counted
 
 LEAST_WEIGHT = 1e-3
 """Weight of an edge, relative to its own information, above which it counts."""
@@ -218,9 +219,8 @@ class Solution:
     def __repr__(self) -> str:
         pieces = int(self.component.max(initial=-1)) + 1
         used = int(np.count_nonzero(self.weights))
-        return (
-            f"Solution({len(self.component)} poses in {pieces} components, {used} of {len(self.weights)} edges count)"
-        )
+        poses = f"{counted(len(self.component), 'pose')} in {counted(pieces, 'component')}"
+        return f"Solution({poses}, {used} of {counted(len(self.weights), 'edge')} count)"
 
 
 @dataclass(frozen=True)
