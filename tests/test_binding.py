@@ -71,6 +71,10 @@ def test_a_stage_by_name_has_its_defaults(tmp_path: Path) -> None:
             "r.yaml:6: start.registration.distances_m:",
         ),
         (
+            "start: {stage: odometry, registration: {stage: gicp, source_points: [5]}}\n",
+            "r.yaml:6: start.registration: distances_m must be positive, source_points at least 11",
+        ),
+        (
             "source: {reader: tum, depth_scale: 1000}\n",
             "r.yaml:6: source.depth_scale: unknown option (did you mean 'source.reader.depth_scale'?)",
         ),
@@ -89,7 +93,7 @@ def test_errors_name_file_line_key_and_what_was_expected(tmp_path: Path, change:
     with pytest.raises(RecipeError) as caught:
         load(tmp_path, SMALL + change)
     assert expected in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(caught.value) and "ArgsKwargs" not in str(caught.value)
 
 
 def test_a_misspelt_section_of_an_override_is_where_it_was_given() -> None:

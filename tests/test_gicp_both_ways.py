@@ -8,7 +8,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.demo.street import Road
 from hodge_pipeline.demo.sweeps import SpinningScanner
 from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
-from hodge_pipeline.registration.gicp import Gicp
+from hodge_pipeline.registration.gicp import Gicp, Vgicp
 from hodge_pipeline.types import Frame, PointCloud
 from lidar_worlds import Stop
 
@@ -28,3 +28,9 @@ def test_sparse_scans_aligned_both_ways_stay_where_they_fit() -> None:
     truth = se3.inverse(first) @ second
     error = se3.inverse(truth) @ registrar.register(prepared[0], prepared[1], truth).i_from_j
     assert np.linalg.norm(error[:3, 3]) < 0.1
+
+
+def test_other_numbers_of_levels_have_the_points_of_the_finest() -> None:
+    """As `distances_m` alone is set, in a recipe or by `register`."""
+    assert Gicp(distances_m=(1.0, 0.3, 0.1, 0.05))._levels == [(1.0, 1000), (0.3, 1000), (0.1, 2000), (0.05, 4000)]
+    assert Vgicp(distances_m=(1.0, 0.3))._levels == [(1.0, 2000), (0.3, 4000)]

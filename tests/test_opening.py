@@ -7,6 +7,7 @@ import pytest
 from hodge_adapters.icl_nuim.reader import IclNuimReader
 from hodge_adapters.seven_scenes.reader import SevenScenesReader
 from hodge_adapters.tum.reader import TumReader
+from hodge_pipeline import registry
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recipe.recipe_file import recipe_names
@@ -74,3 +75,9 @@ def test_a_path_that_is_nothing_keeps_its_own_error(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no depth.txt") as refused:
         open_with_reader(tmp_path, TumReader(), recipe_names())
     assert "looks like" not in str(refused.value)
+
+
+def test_a_path_that_is_not_there_is_told_alike_by_every_reader(tmp_path: Path) -> None:
+    for name in registry.names("readers"):
+        with pytest.raises(SourceError, match="gone: no such file or folder$"):
+            open_with_reader(tmp_path / "gone", registry.load("readers", name)())

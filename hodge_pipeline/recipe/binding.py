@@ -210,6 +210,8 @@ def _first_error(error: ValidationError, where: Where, keys: Keys, known: Mappin
     what = first["msg"][0].lower() + first["msg"][1:]
     if first["type"] == "missing":
         return RecipeError(f"{where(keys)}: {_dotted(here)}: this option is required", keys)
+    if first["type"] == "value_error":  # a stage's own words; its input is no option's value
+        return RecipeError(f"{where(here)}: {_dotted(here)}: {first['ctx']['error']}", here)
     return RecipeError(f"{where(here)}: {_dotted(here)}: {what.rstrip('.')}, got {first['input']!r}", here)
 
 

@@ -67,6 +67,8 @@ def open_with_reader(
     and the recipe for it, where it is among `recipes`.
     """
     chosen = reader or guess_reader(path)
+    if not path.exists():
+        raise SourceError(f"{path}: no such file or folder")
     try:
         source = _opened(chosen, path)
     except SourceError as error:
