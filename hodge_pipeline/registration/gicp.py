@@ -35,8 +35,8 @@ class _SmallGicp:
     source_points: tuple[int, ...] = Field(
         default=(1000, 2000, 4000),
         min_length=1,
-        description="Points of cloud j used at each level, evenly strided, the last at the finest level; those before the "
-        "first number use that one. 4000 lose no accuracy against all 7500 of a room's cloud.",
+        description="Points of cloud j used at each level, evenly strided, the last at the finest level; those before "
+        "the first have as many. 4000 lose no accuracy against all 7500 of a room's cloud.",
     )
     max_iterations: int = Field(
         default=20,
