@@ -89,6 +89,8 @@ def test_page_and_recording(tmp_path: Path) -> None:
     page, recording = write_comparison(tmp_path / "out", found)
     text, addresses = read_page(page)
     assert "a and b" in text and "laid onto A by the 12 frames" in text
+    headline = judge(found.reports[0]).headline
+    assert text.count(headline) == 2, "in each run's banner; in a table of numbers it pushes these off the page"
     assert len(addresses) == 5 and all(address.startswith("data:image/") for address in addresses)
     for side in "ab":
         poses = np.squeeze(rows(recording, layout.poses(side), "Transform3D:translation"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pycolmap
@@ -13,6 +14,7 @@ from colmap_data import FREE, disturbed, noisy
 from hodge_adapters.colmap.models import ColmapModels
 from hodge_adapters.colmap.tracked import ColmapModel
 from hodge_pipeline.cli.main import app
+from hodge_pipeline.cli.refine_colmap import _lines
 from hodge_pipeline.errors import SourceError, WorkspaceError
 from hodge_pipeline.pairs.edits import listed_edges
 
@@ -123,7 +125,10 @@ def test_a_model_that_changed_is_computed_anew_and_another_option_replaces_only_
 
 def test_a_refined_model_and_a_run_never_share_a_folder(tmp_path: Path) -> None:
     model, out = noisy(tmp_path), tmp_path / "out"
-    hodge_pipeline.refine_colmap(model, overrides=FREE, out=out)
+    (result,) = hodge_pipeline.refine_colmap(model, overrides=FREE, out=out).results
+    kept = replace(result.decision, outcome="optimal", reason="already optimal: noise", doubt="")
+    said = _lines(replace(result, decision=kept), alone=True, verbose=False)[0]
+    assert said == "verdict  already optimal: noise", "and not twice"
     with pytest.raises(WorkspaceError, match="holds a refined model: give another --out"):
         hodge_pipeline.run("demo", out, source=tmp_path)
     with pytest.raises(WorkspaceError, match="hodge diagnose .* judges its edges"):

@@ -21,6 +21,7 @@ from hodge_pipeline.types.text import counted
 
 LISTED = 20
 CYCLES_EACH = 2
+NONE = "none"
 MARKS: dict[str, Mark] = {WRONG: "worse", SUSPECT: "mixed", UNTESTABLE: "mixed", CONSISTENT: "better"}
 
 
@@ -159,7 +160,9 @@ def edge_table(contents: PageContents) -> Table:
         "motions around them."
     )
     header = ("edge", "verdict", "what to do", "cycles against", "cycles for", "source", "right", "off by", "leverage")
-    return Table("Edges, the worst first", header, rows, caption, 6, wide=(3, 4))
+    if all(row[4] == NONE for row in rows):  # of loops on a backbone: the column would push numbers off the page
+        header, rows = header[:4] + header[5:], tuple(row[:4] + row[5:] for row in rows)
+    return Table("Edges, the worst first", header, rows, caption, header.index("right"), wide=(3, 4)[: len(header) - 7])
 
 
 def _edge_row(contents: PageContents, row: int) -> tuple[str, ...]:
@@ -172,7 +175,7 @@ def _edge_row(contents: PageContents, row: int) -> tuple[str, ...]:
         str(diagnosis.verdict[row]),
         contents.advice[row],
         _cycles(contents, diagnosis.witnesses_against[row]) or _without_cycle(contents, row),
-        _cycles(contents, diagnosis.witnesses_for[row]) or "none",
+        _cycles(contents, diagnosis.witnesses_for[row]) or NONE,
         str(graph.source[row]),
         number(100 * diagnosis.probability[row], ".0f", " %"),
         ", ".join(off) if np.isfinite(diagnosis.residual_m[row]) else "–",
@@ -194,7 +197,7 @@ def _cycles(contents: PageContents, rows: Ints) -> str:
 def _without_cycle(contents: PageContents, row: int) -> str:
     """The reason for the verdict on a bad edge without a listed cycle, such as a backbone."""
     is_bad = contents.diagnosis.verdict[row] in (WRONG, SUSPECT)
-    return in_unit(contents.diagnosis.reason[row], contents.has_metres) if is_bad else "none"
+    return in_unit(contents.diagnosis.reason[row], contents.has_metres) if is_bad else NONE
 
 
 def _suggestions(contents: PageContents) -> Iterator[Section]:

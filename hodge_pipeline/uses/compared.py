@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -35,6 +35,8 @@ SAME = 0.005
 """A relative difference that whole per cents do not show."""
 NOTHING_M = 1e-6
 """A distance of poses below which they are the same: rounding."""
+VERDICT = "verdict"
+"""The row that holds a sentence."""
 SHOWN_MODELS = ("mesh", "cloud")
 """Fused models that are shown, the first that a run has."""
 
@@ -114,7 +116,7 @@ def _measured(comparison: Comparison) -> Iterator[tuple[str, ...]]:
     a, b = comparison.reports
     floor_m = floor_of(comparison.a.poses[:, :3, 3], comparison.b.poses[:, :3, 3])
     yield "frames", str(a.source.frames), str(b.source.frames), ""
-    yield "verdict", judge(a).headline, judge(b).headline, ""  # with its doubts, as of the truth's clock
+    yield VERDICT, judge(a).headline, judge(b).headline, ""  # with its doubts, as of the truth's clock
     for label, quantity, is_length in _QUANTITIES:
         before, after = _finite(quantity(a)), _finite(quantity(b))
         if before is not None or after is not None:
@@ -250,12 +252,15 @@ def _page(comparison: Comparison, models: tuple[Model | None, Model | None]) -> 
         else "The runs share too few frames."
     )
     judged = zip(comparison.names, map(judge, comparison.reports), strict=True)
+    measured, options = tables(comparison)
+    numbers = tuple(row for row in measured.rows if row[0] != VERDICT)  # the banners say it, a column would be as wide
     return Document(
         f"{a} and {b}",
         f"A: {comparison.a.folder}. B: {comparison.b.folder}. {laid}",
-        tuple(Banner("", name, (verdict.sentence,)) for name, verdict in judged),
+        tuple(Banner("", f"{name}: {verdict.headline}", verdict.points) for name, verdict in judged),
         sections=(
-            *(Section.of(each) for each in tables(comparison)),
+            Section.of(replace(measured, rows=numbers)),
+            Section.of(options),
             Section("The models from four sides", f"Left: {a}. Right: {b}.", pictures=_sides(comparison, models)),
             Section("Trajectories", pictures=draw(_paths(comparison))),
         ),
