@@ -159,6 +159,7 @@ def edge_table(contents: PageContents) -> Table:
         "share in the relative pose of its ends; at 100 % the scene falls apart without it. Cycles: the product of "
         "motions around them."
     )
+    header: tuple[str, ...]
     header = ("edge", "verdict", "what to do", "cycles against", "cycles for", "source", "right", "off by", "leverage")
     if all(row[4] == NONE for row in rows):  # of loops on a backbone: the column would push numbers off the page
         header, rows = header[:4] + header[5:], tuple(row[:4] + row[5:] for row in rows)
