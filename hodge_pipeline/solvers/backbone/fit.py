@@ -252,8 +252,10 @@ def optimised(fit: Fit, steps: int) -> Fit:
         if won < (LEAST_WON if before < torn else SHARE_WON * before):
             break
         for _ in range(HALVINGS):
-            tried = replace(fit, linear=linearise(fit.linear.chain, fit.moved(moves)))
-            if tried.cost < before:
+            with np.errstate(over="ignore", invalid="ignore"):  # far too long a step ends in no number, and is halved
+                tried = replace(fit, linear=linearise(fit.linear.chain, fit.moved(moves)))
+                is_better = tried.cost < before
+            if is_better:
                 fit = tried
                 break
             moves = moves / 2
