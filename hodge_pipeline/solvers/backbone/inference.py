@@ -66,17 +66,25 @@ def infer(
     loops agree by them, and the loops are likelier.
     """
     given, shares = learn_scales(chain, outliers) if scales is None else (scales, EVEN)
-    found = _Trial.of(chain, outliers, trusted, may_thin, given, shares).inferred()
+    found = _Trial.of(chain, outliers, trusted, may_thin, given, shares).found()
     for _ in range(MOST_LEARNED if scales is None else 0):
         if found is None or not found.confirmed:
             break
-        trial = _Trial.of(chain, outliers, trusted, may_thin, found.scales_here, EVEN)
-        is_other = found.scales.differ_much(trial.scales) and trial.changes(found)
-        other = trial.inferred() if is_other else None
+        here = found.scales_here
+        if not found.scales.differ_much(here) or not _others_agree(found, here.applied(chain), outliers):
+            break
+        other = _Trial.of(chain, outliers, trusted, may_thin, here, EVEN).found()
         if other is None or other.log_evidence <= found.log_evidence:
             break
         found = other
     return found
+
+
+def _others_agree(found: Inferred, chain: Chain, outliers: OutlierModel) -> bool:
+    """Whether by other errors, those of `chain`, other loops than the used ones agree with the poses found."""
+    linear = replace(found.linear, chain=chain)
+    judged = judge(linear, Fit(found.reduced, linear), EVEN, outliers)
+    return bool((_agreeing(judged) != found.used).any())
 
 
 MOST_LEARNED = 3
@@ -118,26 +126,18 @@ class _Trial:
         start = linearise(chain, chain.poses)
         return cls(start, judge(start, None, shares, outliers), shares, outliers, trusted, may_thin, scales)
 
-    def changes(self, found: Inferred) -> bool:
-        """Whether by these scales other loops agree with the poses that the used ones lead to than those."""
-        linear = replace(found.linear, chain=self.start.chain)
+    def found(self) -> Inferred | None:
+        """What is `inferred`, or that nothing is used where nothing can be computed."""
         try:
-            agreed = self.agreed(found.used, self.shares, linear)
-        except np.linalg.LinAlgError:
-            return False
-        return agreed is not None and bool((agreed[0] != found.used).any())
-
-    def inferred(self) -> Inferred | None:
-        """The loops judged at the poses of the right ones; None where these are too many: see `infer`."""
-        try:
-            return self._inferred()
+            return self.inferred()
         except np.linalg.LinAlgError:  # loops tear paths so far apart that covariances are lost in rounding
             reduced = thinned(self.start.chain, np.flatnonzero(self.trusted))
             return Inferred(
                 self.trusted, self.alone, self.scales, self.start, self.start, reduced, 0.0, confirmed=False
             )
 
-    def _inferred(self) -> Inferred | None:
+    def inferred(self) -> Inferred | None:
+        """The loops judged at the poses of the right ones; None where these are too many: see `infer`."""
         grown = self.grown()
         if grown is None:
             return None
@@ -266,7 +266,7 @@ class _Trial:
                 break
             seen = np.packbits(used).tobytes()
         judged, linear = best
-        return (judged.factor > _limit(judged)) & (judged.log_odds > 0), judged, linear
+        return _agreeing(judged), judged, linear
 
 
 def _single_joins(chain: Chain, used: Bools) -> Bools:
@@ -293,6 +293,11 @@ BY_CHANCE, BY_CHANCE_EACH_FOLD = float(np.log(100.0)), 3.0
 """Log-evidence that chance reaches in one graph of a hundred, and its increase with each e-fold of loops, measured with
 random loops in simulated graphs and in those of Bicocca and RobotCar, whose best reach half of it.
 """
+
+
+def _agreeing(judged: Judged) -> Bools:
+    """The loops (M,) that are likely right, by more than one of the wrong ones may reach."""
+    return (judged.factor > _limit(judged)) & (judged.log_odds > 0)
 
 
 def _limit(judged: Judged) -> float:

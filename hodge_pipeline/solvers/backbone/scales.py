@@ -99,6 +99,7 @@ class Scales:
     def at_solution(self, fit: Fit) -> Scales:
         """These scales, by which the fit was made, times how much larger residuals are there than they should be: the
         median of each kind, of runs of steps or loops, at poses solved without it. The same where these are few.
+        Not above the bounds of `learn_scales`: bent poses make errors of any size.
         """
         split, factors = fit.linear.chain.rotation_axes, np.ones(4)
         for kind, rows in enumerate((fit.reduced.of_runs, fit.reduced.of_loops)):
@@ -108,7 +109,12 @@ class Scales:
                     chi2 = mahalanobis(residual[:, axes], covariance[:, axes, axes])[0]
                     usual = np.median(chi2) / chdtri(residual[:, axes].shape[1], 0.5)
                     factors[2 * kind + part] = np.sqrt(max(usual, np.finfo(float).tiny))
-        return Scales(*(np.array(astuple(self)) * factors).tolist())
+        chain, stated = fit.linear.chain, np.log(astuple(self))
+        most = stated + _upper_bounds(chain)  # of the chain with these scales
+        turn, shift, *own = np.minimum(stated + np.log(factors), most).tolist()
+        if chain.stated:
+            turn, shift = min(turn, shift + MOST_RATIO), min(shift, turn + MOST_RATIO)
+        return Scales(*np.exp([turn, shift, *own]).tolist())
 
     def units(self, chain: Chain) -> tuple[Floats, Floats]:
         """The factor on each free axis (p,), of steps and of loops."""
