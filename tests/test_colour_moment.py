@@ -103,6 +103,11 @@ def test_a_step_is_sure_only_inside_those_tried_and_far_above_those_beyond_its_n
     assert colour_moment._sure_step(found) is None, "a camera that goes to and fro"
 
 
+def test_frames_farther_apart_that_call_no_step_best_make_no_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(colour_moment, "_sure_step", lambda found: 0)
+    assert [note.kind for note in late_doubts(passed(2))] == ["colour of another moment"]
+
+
 def test_stamps_that_tell_of_it_are_counted() -> None:
     assert late_doubts(passed(2, delay_s=-2 / 30)) == (), "its stamps say that colour is two steps earlier"
     (note,) = late_doubts(passed(1, delay_s=1 / 30))

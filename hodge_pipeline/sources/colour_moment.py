@@ -40,7 +40,7 @@ def late_doubts(frames: Sequence[Frame]) -> tuple[Note, ...]:
     if is_near.all() or not is_near.any() or is_near[best] or not _is_surely_better(found, best, is_near):
         return ()
     late = _sure_step(_sampled(frames, 2 * MOST_LATE))
-    if late is None:
+    if not late:
         return (Note("colour of another moment", detail=_told(best - MOST_LATE)),)
     return (Note("colour paired anew", late, _told(late)),)
 

@@ -71,7 +71,7 @@ def infer(
         if found is None or not found.confirmed:
             break
         here = found.scales_here
-        if not found.scales.differ_much(here) or not _others_agree(found, here.applied(chain), outliers):
+        if not found.scales.differ_much(here) or not _others_agree(found, here.applied(chain), outliers, trusted):
             break
         other = _Trial.of(chain, outliers, trusted, may_thin, here, EVEN).found()
         if other is None or other.log_evidence <= found.log_evidence:
@@ -80,11 +80,13 @@ def infer(
     return found
 
 
-def _others_agree(found: Inferred, chain: Chain, outliers: OutlierModel) -> bool:
-    """Whether by other errors, those of `chain`, other loops than the used ones agree with the poses found."""
+def _others_agree(found: Inferred, chain: Chain, outliers: OutlierModel, trusted: Bools) -> bool:
+    """Whether by other errors, those of `chain`, other loops than the used ones agree with the poses found; `trusted`
+    (M,) are used in any case.
+    """
     linear = replace(found.linear, chain=chain)
     judged = judge(linear, Fit(found.reduced, linear), EVEN, outliers)
-    return bool((_agreeing(judged) != found.used).any())
+    return bool(((_agreeing(judged) | trusted) != found.used).any())
 
 
 MOST_LEARNED = 3

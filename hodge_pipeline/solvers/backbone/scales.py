@@ -109,9 +109,9 @@ class Scales:
                     chi2 = mahalanobis(residual[:, axes], covariance[:, axes, axes])[0]
                     usual = np.median(chi2) / chdtri(residual[:, axes].shape[1], 0.5)
                     factors[2 * kind + part] = np.sqrt(max(usual, np.finfo(float).tiny))
-        chain, stated = fit.linear.chain, np.log(astuple(self))
-        most = stated + _upper_bounds(chain)  # of the chain with these scales
-        turn, shift, *own = np.minimum(stated + np.log(factors), most).tolist()
+        chain, logs = fit.linear.chain, np.log(astuple(self))
+        # the chain has these scales, so that its bounds are relative to them
+        turn, shift, *own = (logs + np.minimum(np.log(factors), _upper_bounds(chain))).tolist()
         if chain.stated:
             turn, shift = min(turn, shift + MOST_RATIO), min(shift, turn + MOST_RATIO)
         return Scales(*np.exp([turn, shift, *own]).tolist())
