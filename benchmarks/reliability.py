@@ -64,12 +64,18 @@ def _real(folder: Path) -> list[tuple[Floats, Bools]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--graphs", type=int, default=60, help="simulated graphs")
-    parser.add_argument("--right", type=int, default=0, help="instead, so many simulated graphs without a wrong edge")
+    parser.add_argument(
+        "--right", type=int, default=0, help="instead, so many graphs of either law without a wrong edge"
+    )
     options = parser.parse_args()
     if options.right:
-        found = [(kind, ~diagnose(graph).kept & right) for kind, graph, right in several(range(options.right), 0.0)]
-        blamed = [(kind, int(out.sum())) for kind, out in found if out.any()]
-        print(f"a right edge is blamed in {len(blamed)} of {options.right} graphs: {blamed}")
+        for law, heavy_tails in (("Gaussian", False), ("Student's t, 4 degrees of freedom", True)):
+            graphs = several(range(options.right), 0.0, heavy_tails)
+            found = [(kind, int((~diagnose(graph).kept & right).sum())) for kind, graph, right in graphs]
+            blamed = [each for each in found if each[1]]
+            print(
+                f"errors {law}: right edges are blamed in {len(blamed)} of {options.right} graphs: {blamed}", flush=True
+            )
         return
     simulations: dict[str, list[tuple[Floats, Bools]]] = {}
     for kind, graph, right in several(range(options.graphs)):

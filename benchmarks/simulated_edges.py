@@ -18,16 +18,19 @@ RIGHT_SIGMAS = 10.0
 WRONG_SHARES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9)
 
 
-def simulated(seed: int, wrong: float | None = None) -> tuple[str, ViewGraph, Bools]:
-    """The kind, a graph of 30 to 90 views and where (E,) its edges are right; `wrong`: their share, drawn where None.
+def simulated(seed: int, wrong: float | None = None, heavy_tails: bool | None = None) -> tuple[str, ViewGraph, Bools]:
+    """The kind, a graph of 30 to 90 views and where (E,) its edges are right; `wrong`: the share of wrong ones,
+    `heavy_tails`: whether errors are Student's t and not Gaussian, both drawn where None.
 
-    Drawn by the seed: dense or sparse, Gaussian errors or Student's t, wrong edges at random or in groups that agree.
+    Drawn by the seed: dense or sparse, errors of either kind, wrong edges at random or in groups that agree.
     """
     rng = np.random.default_rng(seed)
     kind = KINDS[seed % len(KINDS)]
     poses = _walk(kind, int(rng.integers(30, 90)), rng)
     pairs = _right_pairs(poses, int(rng.integers(1, 5)), float(rng.uniform(0.3, 4)), rng)
-    errors = rng.standard_t(4, (len(pairs), 6)) if rng.integers(2) else rng.normal(size=(len(pairs), 6))
+    drawn = bool(rng.integers(2))
+    is_heavy = drawn if heavy_tails is None else heavy_tails
+    errors = rng.standard_t(4, (len(pairs), 6)) if is_heavy else rng.normal(size=(len(pairs), 6))
     motions = between(poses, pairs) @ se3.exp(errors * SIGMA)
     share = float(rng.choice(WRONG_SHARES)) if wrong is None else wrong
     count = int(share / (1 - share) * len(pairs))
@@ -38,9 +41,11 @@ def simulated(seed: int, wrong: float | None = None) -> tuple[str, ViewGraph, Bo
     return kind, ViewGraph.from_edges(np.arange(len(poses)), edges, motion), np.asarray(right)
 
 
-def several(seeds: range, wrong: float | None = None) -> Iterator[tuple[str, ViewGraph, Bools]]:
+def several(
+    seeds: range, wrong: float | None = None, heavy_tails: bool | None = None
+) -> Iterator[tuple[str, ViewGraph, Bools]]:
     """One graph for each seed."""
-    return (simulated(seed, wrong) for seed in seeds)
+    return (simulated(seed, wrong, heavy_tails) for seed in seeds)
 
 
 def _walk(kind: str, count: int, rng: np.random.Generator) -> Floats:
