@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.executors.local import InProcess
+from hodge_pipeline.fusion.cloud import depth_points
 from hodge_pipeline.registration import clouds as clouds_module
 from hodge_pipeline.registration import voxel_means
 from hodge_pipeline.registration.cloud_set import FRAMES_IN_BLOCK, prepare_clouds
@@ -105,6 +106,16 @@ def test_colours_are_averaged_and_an_image_of_another_size_is_looked_up() -> Non
     x = cloud.points_in_cam[:, 0]
     assert (cloud.colours[x < -0.05] == 0).all()
     assert (cloud.colours[x > 0.05] == [200, 100, 50]).all()
+
+
+@pytest.mark.parametrize("side", [3, 5])
+def test_a_pixel_has_the_colour_in_its_middle_in_a_finer_image_of_the_same_view(side: int) -> None:
+    image = np.zeros((CAMERA.height * side, CAMERA.width * side, 3), np.uint8)
+    image[side // 2 :: side, side // 2 :: side] = [200, 100, 50]
+    registered, _ = make_cloud(frame(wall(WALL_M), read_colour=lambda: image), CloudOptions())
+    fused = depth_points(wall(WALL_M), image, CAMERA, 2, 0.2, 6.0)
+    for cloud in (registered, fused):
+        assert cloud.colours is not None and (cloud.colours == [200, 100, 50]).all()
 
 
 def test_a_colour_image_that_cannot_be_read_costs_the_colours_alone() -> None:

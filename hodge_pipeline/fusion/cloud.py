@@ -14,6 +14,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.fusion.views import Skipped, posed
 from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types import Bools, Bytes, Camera, Floats, Floats32, Frame, Ints, Model, PointCloud
+from hodge_pipeline.types.arrays import middles_in
 from hodge_pipeline.types.text import counted
 
 POINTS_AT_ONCE = 1 << 20
@@ -117,18 +118,13 @@ def depth_points(
     v, u = np.mgrid[0 : depth_m.shape[0] : stride, 0 : depth_m.shape[1] : stride]
     grid = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
     valid = (z >= max(min_depth_m, 1e-6)) & (z <= max_depth_m)
+    if colour is not None:
+        colour = colour[middles_in(colour.shape[0], v, len(depth_m)), middles_in(colour.shape[1], u, depth_m.shape[1])]
     return PointCloud(
         points_in_cam=grid[valid].astype(np.float32),
         normals_in_cam=_normals(grid)[valid].astype(np.float32),
-        colours=None if colour is None else _at(colour, depth_m.shape, stride)[valid],
+        colours=None if colour is None else colour[valid],
     )
-
-
-def _at(colour: Bytes, depth_shape: tuple[int, ...], stride: int) -> Bytes:
-    """The colours of the strided depth pixels; the images may differ in size, not in field of view."""
-    rows = (2 * np.arange(0, depth_shape[0], stride) + 1) * colour.shape[0] // (2 * depth_shape[0])
-    columns = (2 * np.arange(0, depth_shape[1], stride) + 1) * colour.shape[1] // (2 * depth_shape[1])
-    return colour[np.ix_(rows, columns)]
 
 
 def _normals(grid: Floats) -> Floats:

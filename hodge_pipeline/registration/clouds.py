@@ -14,6 +14,7 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.registration.voxel_means import voxel_means
 from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats32, Frame, Landmarks, PointCloud
+from hodge_pipeline.types.arrays import middles_in
 from hodge_pipeline.types.text import counted
 
 MIN_POINTS_FOR_NORMALS = 5
@@ -208,8 +209,7 @@ def _back_project(frame: Frame, read_depth: Callable[[], Floats32], camera: Came
     if options.colours and frame.read_colour is not None and len(rows):
         try:
             image = frame.read_colour()
-            # A colour image of another size covers the same view: take the pixel at the same share of it.
-            v, u = v * image.shape[0] // depth.shape[0], u * image.shape[1] // depth.shape[1]
+            v, u = middles_in(image.shape[0], v, len(depth)), middles_in(image.shape[1], u, depth.shape[1])
             colours = image.reshape(-1, 3).take(v[rows] * image.shape[1] + u[columns], axis=0)
             blank = is_blank(image)
         except (SourceError, OSError) as error:

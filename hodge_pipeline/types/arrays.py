@@ -1,4 +1,4 @@
-"""Names for the types of arrays, rows chosen from them, and their root mean square."""
+"""Names for the types of arrays, rows chosen from them, pixels of another size of image, and root mean squares."""
 
 from typing import TypeAlias
 
@@ -17,6 +17,13 @@ def evenly(available: int, most: int) -> Ints:
     """At most so many rows (N,) of `available`, spread evenly, the first and the last among them."""
     kept = max(min(most, available), 0)
     return np.unique(np.linspace(0, available - 1, kept).round().astype(np.int64)) if kept else np.zeros(0, np.int64)
+
+
+def middles_in(side: int, pixels: Ints, of_side: int) -> Ints:
+    """The rows, or columns, of an image with `side` of them in which the middles of an image's `pixels` lie, which has
+    `of_side` and shows the same view.
+    """
+    return (2 * pixels + 1) * side // (2 * of_side)
 
 
 def rms(values: Floats) -> float:
