@@ -27,5 +27,4 @@ def evaluate(
     clouds: CloudSet, sets: dict[str, Floats], reference: str, scale: float, *, workers: Workers, step: Step
 ) -> ScoreTable:
     """Step: the scores of named sets of poses (K, 4, 4), on the pairs that overlap under the `reference` one."""
-    assert clouds.folder is not None
     return score_table(clouds.folder, sets, reference, workers, scale=scale)

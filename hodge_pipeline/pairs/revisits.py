@@ -89,7 +89,6 @@ class _Path:
     """The path so far: its poses as corrected by loops, and the lengths of steps between its views."""
 
     def __init__(self, clouds: CloudSet, world_from_cam: Floats, part: Ints, options: Revisits, known: Edges) -> None:
-        assert clouds.folder is not None
         self._options = options
         self._prepared, self._has_points = PreparedClouds(clouds.folder, options.registration), clouds.sizes > 0
         self._clouds, self._range_m = clouds, median_range_m(clouds, np.flatnonzero(self._has_points))

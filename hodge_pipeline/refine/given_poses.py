@@ -195,7 +195,6 @@ def held_out_distances_m(
     clouds: CloudSet, pairs: Ints, pose_sets: Floats, scale: float, *, workers: Workers, step: Step
 ) -> Floats:
     """Step: cloud distances (S, P) of the pairs (P, 2) under S sets of poses (S, K, 4, 4), metres."""
-    assert clouds.folder is not None
     return edge_distances(clouds.folder, pairs, pose_sets, workers, scale=scale)
 
 

@@ -90,7 +90,7 @@ def held_out(count: int, share: float, seed: int) -> Bools:
 
 def held_out_distances(edges: DepthEdges, pose_sets: Floats, workers: Workers) -> Floats:
     """Cloud distances (S, H) of the pairs held out under S sets of poses (S, N, 4, 4) of all images, metres."""
-    if edges.clouds is None or edges.clouds.folder is None or not len(edges.held_out):
+    if edges.clouds is None or not len(edges.held_out):
         return np.zeros((len(pose_sets), 0))
     return edge_distances(edges.clouds.folder, edges.held_out, pose_sets[:, edges.images], workers)
 

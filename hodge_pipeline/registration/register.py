@@ -40,7 +40,6 @@ def register_edges(
     these poses, or, by GICP, where that guess is nearer to it than the earlier one, from `earlier_from (N, 4, 4)`:
     GICP would converge to it again. `scale` multiplies lengths; `min_spread`: see `Acceptance`.
     """
-    assert clouds.folder is not None
     held_out = edges.status == HELD_OUT
     candidates = edges.select(~held_out)
     guesses = se3.between(world_from_cam, candidates.pairs)

@@ -72,7 +72,6 @@ def register_named_pairs(
     step: Step,
 ) -> Edges:
     """Step: these pairs registered from their guesses (P, 4, 4), with `matching` where these are NaN."""
-    assert clouds.folder is not None
     unknown = np.asarray(np.isnan(guesses).any(axis=(1, 2)))
     near, far = pairs[~unknown], pairs[unknown]
     found = [register_pairs(clouds.folder, registrar, Edges.of(near), guesses[~unknown], workers, step.advance)]

@@ -46,7 +46,6 @@ def add_landmarks(source: Source, made: CloudSet, options: CloudOptions, *, work
         step.advance(len(block))
         return block
 
-    assert made.folder is not None
     folder, found = step.folder / CLOUDS, workers.map(partial(landmarks_of, options), in_blocks(source.frames))
     CloudSet.write(folder, map(counted_in, in_order(found)))
     for name in CloudSet.OF_POINTS:

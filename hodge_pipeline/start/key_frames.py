@@ -274,7 +274,6 @@ def _move_landmarks(source: Source, tracked: Tracked, twists: Floats) -> None:
     """Move the landmarks of the key frames, in their file, to where they were at the stamps of their frames."""
     if not len(tracked.clouds.mark_points):
         return
-    assert tracked.clouds.folder is not None
     points = np.load(tracked.clouds.folder / "mark_points.npy", mmap_mode="r+")
     for key, row in enumerate(tracked.key_rows.tolist()):
         own, frame = slice(*tracked.clouds.marks[key : key + 2].tolist()), source.frames[row]

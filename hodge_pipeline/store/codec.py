@@ -56,7 +56,7 @@ def _plain(folder: Path, value: Any, place: str, arrays: dict[str, NDArray[Any]]
         arrays[place or "bytes"] = np.frombuffer(value, np.uint8)
         return {"bytes": place or "bytes"}
     if isinstance(value, CloudSet):
-        own = value.folder
+        own = value.stored_in
         if own is None or own.parent != folder:
             own = folder / (place or CLOUDS)
             value.save(own)

@@ -67,8 +67,7 @@ class CloudSet(Sequence[PointCloud]):
 
     `offsets (N + 1,)` cut `points (P, 3)`, `normals (P, 3)`, `colours (P, 3)` into frames; an empty slice is a frame
     without a valid measurement. `marks (N + 1,)` cut the landmarks' `mark_points (Q, 3)`, `mark_descriptors (Q, 128)`
-    and `mark_pixel_rad (Q,)` likewise. `folder` is where the columns lie, which worker processes open; None of what is
-    in memory.
+    and `mark_pixel_rad (Q,)` likewise. `stored_in` is the folder of the columns; None of what is in memory.
     """
 
     OF_POINTS = ("offsets", "points", "normals", "colours")
@@ -86,7 +85,7 @@ class CloudSet(Sequence[PointCloud]):
         mark_pixel_rad: Floats32,
         folder: Path | None = None,
     ) -> None:
-        self.folder, self._reads = folder, 0
+        self.stored_in, self._reads = folder, 0
         self.offsets, self.points, self.normals, self.colours = offsets, points, normals, colours
         self.marks, self.mark_points, self.mark_descriptors = marks, mark_points, mark_descriptors
         self.mark_pixel_rad = mark_pixel_rad
@@ -163,6 +162,12 @@ class CloudSet(Sequence[PointCloud]):
             column = getattr(self, name)
             if isinstance(column, np.memmap) and hasattr(mmap, "MADV_DONTNEED"):
                 column._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
+
+    @property
+    def folder(self) -> Path:
+        """Where the columns lie, for worker processes to open; not of clouds in memory."""
+        assert self.stored_in is not None, "clouds in memory have no folder: save them first"
+        return self.stored_in
 
     @property
     def sizes(self) -> Ints:
