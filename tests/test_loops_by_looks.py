@@ -15,8 +15,9 @@ from hodge_pipeline.registration.odometry_path import drift_of
 from hodge_pipeline.scene import Drift, Round
 from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.start.odometry import close_loops
-from hodge_pipeline.start.unordered.loops import find_loops, is_worth_it
+from hodge_pipeline.start.unordered.loops import find_loops, is_long
 from hodge_pipeline.start.unordered.options import GlobalStart
+from hodge_pipeline.start.unordered.start import uses_images
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Landmarks, PointCloud, Registration, Source
 
 RADIUS_M, STEP_M, ROUNDS = 10.0, 0.3, 1.15
@@ -114,7 +115,7 @@ def closed(walk: Walk, folder: Path) -> tuple[Edges, Floats]:
     """The loops by looks, and the poses with all loops closed."""
     step = Step(folder, no_progress, lambda *_: None)
     options = Revisits(), GlobalStart()
-    assert is_worth_it(walk.clouds, walk.steps, walk.drift, *options)
+    assert is_long(walk.clouds, walk.steps, walk.drift, options[0]) and uses_images(walk.clouds, options[1])
     loops = find_loops(walk.source, walk.clouds, walk.steps, walk.drift, *options, workers=InProcess(), step=step)
     return loops, close_loops(walk.clouds, walk.first, PART, Revisits(), loops, step=step).world_from_cam
 
@@ -146,4 +147,4 @@ def test_a_short_path_and_one_without_landmarks_are_not_searched(tmp_path: Path,
         steps = steps.select(slice(100))
     else:
         clouds = CloudSet.from_clouds([PointCloud(one.points_in_cam) for one in clouds])
-    assert not is_worth_it(clouds, steps, walk.drift, Revisits(), GlobalStart())
+    assert not (is_long(clouds, steps, walk.drift, Revisits()) and uses_images(clouds, GlobalStart()))

@@ -19,8 +19,9 @@ from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.clouds import make_clouds, with_landmarks
 from hodge_pipeline.start.unordered.join import join_parts
-from hodge_pipeline.start.unordered.loops import find_loops, is_long, is_worth_it
+from hodge_pipeline.start.unordered.loops import find_loops, is_long
 from hodge_pipeline.start.unordered.options import GlobalStart
+from hodge_pipeline.start.unordered.start import uses_images
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Source
 from hodge_pipeline.types.notes import Note, notes_of
 
@@ -87,11 +88,11 @@ class OdometryStart(OdometryOptions):
             known, count = None, len(found.world_from_cam)
             if self.relocalise == "auto" and is_long(clouds, found.steps, drift, self.revisits):
                 clouds = with_landmarks(keys, clouds, options, self.unordered, steps, workers)
-            if self.relocalise == "auto" and is_worth_it(clouds, found.steps, drift, self.revisits, self.unordered):
-                known = steps.step(
-                    find_loops, keys, clouds, found.steps, drift, self.revisits, self.unordered,
-                    title="loops by what frames look like", total=count, workers=workers,
-                )  # fmt: skip
+                if uses_images(clouds, self.unordered):  # surfaces alone look alike too often
+                    known = steps.step(
+                        find_loops, keys, clouds, found.steps, drift, self.revisits, self.unordered,
+                        title="loops by what frames look like", total=count, workers=workers,
+                    )  # fmt: skip
             closed = steps.step(
                 close_loops, clouds, first, drift.part, self.revisits, known, title="loops along the path", total=count
             )
@@ -123,7 +124,6 @@ def chain(
     step: Step,
 ) -> Odometry:
     """Step: poses of all frames by `registration.odometry`."""
-    assert clouds.folder is not None
     found = odometry(clouds.folder, sequences, stamps_s, options, workers, step.advance)
     step.note(*notes_of("start", found.notes))
     return found

@@ -66,7 +66,6 @@ def start_without_guess(
     step: Step,
 ) -> Start:
     """Step: the poses by global registration; where no two components of odometry are joined, those of odometry."""
-    assert clouds.folder is not None
     frames = Frames(source.frames, clouds.folder, vertex_ids(source), edges, drift)
     scratch = step.folder / "scratch"
     found = find_start(frames, options, scratch, workers, step.advance)

@@ -15,17 +15,12 @@ from hodge_pipeline.scene import Drift, vertex_ids
 from hodge_pipeline.solvers.backbone.trust import SEQUENTIAL
 from hodge_pipeline.stages import Step, Workers
 from hodge_pipeline.start.unordered.options import GlobalStart
-from hodge_pipeline.start.unordered.start import Frames, tried, uses_images, weighed_matches
+from hodge_pipeline.start.unordered.start import Frames, tried, weighed_matches
 from hodge_pipeline.types import CloudSet, Edges, Source, ViewGraph
 from hodge_pipeline.types.notes import Note
 
 SIMILAR_PER_FRAME = 3
 """Frames that each is matched with, 4 ms a pair: a few loops are enough, from which revisits find the others."""
-
-
-def is_worth_it(clouds: CloudSet, odometry: Edges, drift: Drift, revisits: Revisits, options: GlobalStart) -> bool:
-    """Whether the path is long, and frames have landmarks: surfaces alone look alike too often."""
-    return is_long(clouds, odometry, drift, revisits) and uses_images(clouds, options)
 
 
 def is_long(clouds: CloudSet, odometry: Edges, drift: Drift, revisits: Revisits) -> bool:
@@ -55,7 +50,6 @@ def find_loops(
     stretch = np.floor(path_length_m(drift.world_from_cam, range_m) / revisits.every_m)
     rows = np.flatnonzero(seeing)[np.unique(stretch[seeing], return_index=True)[1]]
     reach = int(np.ceil(LOOP_RANGES * range_m / revisits.every_m))
-    assert clouds.folder is not None
     scratch = step.folder / "scratch"
     frames = Frames(source.frames, clouds.folder, ids, odometry, drift)
     few = replace(options, all_pairs_up_to=0, similar_per_frame=SIMILAR_PER_FRAME, reach=reach, loops=())

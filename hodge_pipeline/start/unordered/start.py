@@ -32,8 +32,6 @@ from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Ints,
 from hodge_pipeline.types.edges import REJECTED
 from hodge_pipeline.types.notes import Note, notes_of
 
-DESCRIBED, VIEWS = "described", "views"
-
 
 @dataclass(frozen=True)
 class Start:
@@ -127,14 +125,14 @@ def weighed_matches(
     clouds = CloudSet.open(scene.clouds)
     by_image = uses_images(clouds, options)
     registrar: GlobalRegistrar = options.images if by_image else options.registrar
-    describe = partial(describe_clouds, scene.clouds, registrar, out=scratch / DESCRIBED, workers=workers)
+    described = scratch / "described"
     if options.similar_per_frame:
-        describe(rows, advance=advance)
-    pairs = propose(scene, clouds, rows, scratch / DESCRIBED, options)
+        describe_clouds(scene.clouds, registrar, rows, described, workers, advance)
+    pairs = propose(scene, clouds, rows, described, options)
     if not options.similar_per_frame:  # only what the loops pair needs a description
-        describe(np.unique(pairs), advance=advance)
-    matches = match_pairs(scratch / DESCRIBED, registrar, pairs, workers)
-    views = Views.make(scene.frames, clouds, rows, scratch / VIEWS, workers)
+        describe_clouds(scene.clouds, registrar, np.unique(pairs), described, workers, advance)
+    matches = match_pairs(described, registrar, pairs, workers)
+    views = Views.make(scene.frames, clouds, rows, scratch / "views", workers)
     hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, workers)
     if scene.drift is not None and options.diagnosis.trust != SEQUENTIAL:  # a backbone judges loops and its own steps
         counted = np.flatnonzero(hypotheses.counts)
