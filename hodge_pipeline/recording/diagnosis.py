@@ -11,13 +11,6 @@ from hodge_pipeline.recording.stream import Part, log_markdown
 from hodge_pipeline.types import Edges, Floats, ViewGraph
 from hodge_pipeline.types.text import markdown_table
 
-COLOURS = {
-    CONSISTENT: (60, 115, 225),
-    UNTESTABLE: (150, 150, 150),
-    SUSPECT: (230, 160, 0),
-    WRONG: (230, 60, 160),
-}
-"""Blue, grey, amber, magenta: apart in hue and in brightness; whatever else a verdict may be is white."""
 RADII = {CONSISTENT: -0.4, UNTESTABLE: -0.6, SUSPECT: -1.2, WRONG: -1.6}
 BYTES_EACH = 160
 LISTED = 40
@@ -28,12 +21,12 @@ def log_diagnosis(part: Part, graph: ViewGraph, world_from_cam: Floats, edges: E
     log_markdown(part.stream, layout.DIAGNOSIS, summary(graph, edges))
     lines = shapes.segments(world_from_cam, graph.edges)
     drawable = np.isfinite(lines).all(axis=(1, 2))
-    for name in sorted(set(edges.verdict.tolist()) | set(COLOURS)):
+    for name in sorted(set(edges.verdict.tolist()) | set(shapes.VERDICT_COLOURS)):
         rows = np.flatnonzero((edges.verdict == name) & drawable)
         max_bytes, what = part.options.max_bytes("solver") / 2, f"edges called {name} drawn"
         rows = rows[part.some(len(rows), shapes.MOST_LINES, BYTES_EACH, max_bytes, what)]
         labels = [_label(graph, edges, int(row)) for row in rows]
-        colour, radius = COLOURS.get(name, shapes.RESULT_COLOUR), RADII.get(name, -0.8)
+        colour, radius = shapes.VERDICT_COLOURS.get(name, shapes.RESULT_COLOUR), RADII.get(name, -0.8)
         strips = rr.LineStrips3D(lines[rows], colors=[colour], radii=[radius], labels=labels, show_labels=False)
         part.stream.log(layout.verdict(name), strips, static=True)
 

@@ -8,14 +8,16 @@ import rerun as rr
 from hodge_pipeline import se3
 from hodge_pipeline.complex.cycles import loop_products
 from hodge_pipeline.complex.holes import unfilled_loops
+from hodge_pipeline.diagnosis.result import WRONG
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.recording import layout
+from hodge_pipeline.recording.shapes import RESULT_COLOUR, VERDICT_COLOURS
 from hodge_pipeline.recording.stream import Part
 from hodge_pipeline.types import Bytes, Floats, Ints, ViewGraph
 
 MOST_LOOPS = 200
 LOOP_RADIUS = -2.2
-LOOP_COLOURS = np.array([[255, 255, 255], [230, 60, 160]], float)
+LOOP_COLOURS = np.array([RESULT_COLOUR, VERDICT_COLOURS[WRONG]], float)
 MOST_NAMED = 12
 BRIGHT_MEDIANS = 4.0
 """Error at which the colours end, in medians of all loops: the worst stand out, whatever the scene's size."""

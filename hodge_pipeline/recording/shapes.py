@@ -5,13 +5,21 @@ from __future__ import annotations
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.types import Bytes, Floats, Floats32, Ints, Model, ViewGraph
 from hodge_pipeline.types.arrays import evenly
 
 RESIDUAL_COLOURS = np.array([[60, 115, 225], [130, 145, 170], [190, 180, 120], [255, 225, 50]], float)
 """Blue to yellow, ever brighter: legible without red and green, and in grey; the worst edges stand out."""
-IGNORED_COLOUR = (230, 60, 160)
+VERDICT_COLOURS = {
+    CONSISTENT: (60, 115, 225),
+    UNTESTABLE: (127, 127, 127),
+    SUSPECT: (230, 159, 0),
+    WRONG: (213, 48, 143),
+}
+"""Blue, grey, amber, magenta: apart in hue and in brightness, on white paper and before the viewer's dark."""
+IGNORED_COLOUR = VERDICT_COLOURS[WRONG]
 REJECTED_COLOUR = (110, 110, 110)
 RESULT_COLOUR = (255, 255, 255)
 GREY = 190

@@ -10,14 +10,15 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
+from hodge_pipeline.recording.shapes import VERDICT_COLOURS
 from hodge_pipeline.report.document import Picture
 from hodge_pipeline.report.energy import PARTS, EnergyRow
 from hodge_pipeline.report.painting import flattest_plane, matrix_axes, painted
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 from hodge_pipeline.types.text import UNKNOWN_UNIT
 
-COLOURS = {CONSISTENT: "#3c73e1", UNTESTABLE: "#7f7f7f", SUSPECT: "#e69f00", WRONG: "#d5308f"}
-"""Blue, grey, amber, magenta, as in the recording; markers tell them apart without colour."""
+COLOURS = {verdict: "#" + bytes(colour).hex() for verdict, colour in VERDICT_COLOURS.items()}
+"""As in the recording; markers tell them apart without colour."""
 MARKERS = {CONSISTENT: "s", UNTESTABLE: "D", SUSPECT: "^", WRONG: "X"}
 PART_COLOURS = ("#56b4e9", "#e69f00", "#444444")
 GAP_SHARE = 0.25

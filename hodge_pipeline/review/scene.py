@@ -10,8 +10,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.result import CONSISTENT, WRONG
-from hodge_pipeline.recording.shapes import or_grey
-from hodge_pipeline.report.diagnosis_plots import COLOURS as REPORTED
+from hodge_pipeline.recording.shapes import VERDICT_COLOURS, or_grey
 from hodge_pipeline.review.closeup import Closeup, placed, quat_wxyz
 from hodge_pipeline.review.listing import witnesses
 from hodge_pipeline.review.looking import Shown, ball, shown_pair
@@ -20,7 +19,6 @@ from hodge_pipeline.review.session import Session
 from hodge_pipeline.types import CloudSet, Floats, Floats32, Ints
 from hodge_pipeline.types.axes import up_and_ahead
 
-COLOURS = {verdict: tuple(bytes.fromhex(colour[1:])) for verdict, colour in REPORTED.items()}
 SELECTED, BEFORE = (190, 0, 190), (170, 170, 200)
 """Colours of the selected edge, and of the way from where a camera was before the latest decision."""
 MOST_POINTS = 3_000_000
@@ -134,13 +132,18 @@ class Scene:
         with self._server.atomic():
             self._move(settled.world_from_cam, settled.revision)
             self._cameras(settled.world_from_cam)
-            for verdict in COLOURS:
+            for verdict in VERDICT_COLOURS:
                 rows = np.flatnonzero((table.edges.verdict == verdict) & (settled.weights > 0))
                 rows = rows if verdict in look.verdicts else rows[:0]
-                self._lines(f"/edges/{verdict}", settled.world_from_cam, table.graph.edges[rows], COLOURS[verdict], 2.5)
+                self._lines(
+                    f"/edges/{verdict}", settled.world_from_cam, table.graph.edges[rows], VERDICT_COLOURS[verdict], 2.5
+                )
             chosen = table.graph.edges[[look.selected]] if look.selected >= 0 else np.zeros((0, 2), np.int64)
             self._lines("/edges/selected", settled.world_from_cam, chosen, SELECTED, 6.0)
-            for closes, name, colour in ((True, "closing", COLOURS[CONSISTENT]), (False, "failing", COLOURS[WRONG])):
+            for closes, name, colour in (
+                (True, "closing", VERDICT_COLOURS[CONSISTENT]),
+                (False, "failing", VERDICT_COLOURS[WRONG]),
+            ):
                 around = [_around(one.along) for one in cycles if one.closes == closes]
                 self._lines(f"/cycles/{name}", settled.world_from_cam, _joined(around), colour, 3.5)
             scene = self._server.scene
