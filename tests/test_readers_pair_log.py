@@ -60,10 +60,8 @@ def test_information_is_turned_to_radians_and_missing_pairs_are_counted(tmp_path
     path.write_text(f"0 1 3\n{IDENTITY}1 2 3\n{IDENTITY}")
     beside.write_text("0 1 3\n" + information([9, 9, 9, 400, 400, 400], 8.0))
     source = PairLogReader().open(path)
-    assert source.graph is not None and source.notes == (
-        "1 of 2 pairs are not in a.info: they get its median matrix",
-        "information of a.info",
-    )
+    assert source.graph is not None and source.notes == ("1 of 2 pairs are not in a.info: they get its median matrix",)
+    assert source.contents == ("information of the pairs: a.info",), "a fact for inspect, nothing to look at"
     expected = np.diag([100.0, 100, 100, 9, 9, 9])
     expected[2, 3] = expected[3, 2] = 4.0
     np.testing.assert_array_equal(source.graph.information, [expected, expected])

@@ -67,9 +67,9 @@ class PairLogReader:
         if beside is not None:
             matrices = read_information(beside)
             graph = replace(graph, information=_matched(beside, found.pairs, matrices, notes))
-            notes.append(f"information of {beside.name}")
         files = (path,) if beside is None else (path, beside)
-        return Source(path.stem, path, graph=graph, notes=tuple(notes), files=files, of_cameras=True)
+        contents = () if beside is None else (f"information of the pairs: {beside.name}",)
+        return Source(path.stem, path, graph=graph, notes=tuple(notes), files=files, of_cameras=True, contents=contents)
 
     def _information_file(self, path: Path) -> Path | None:
         if isinstance(self.information, Path):
