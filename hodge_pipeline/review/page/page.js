@@ -216,8 +216,7 @@ function pressed(event) {
 }
 
 function hasWebGl() {
-  const canvas = document.createElement("canvas");
-  return Boolean(canvas.getContext("webgl2") || canvas.getContext("webgl"));
+  return Boolean(document.createElement("canvas").getContext("webgl2")); // viser cannot draw with the first WebGL
 }
 
 for (const verb of ["disable", "enable", "right"]) $(verb).onclick = () => decide(verb);
