@@ -30,6 +30,7 @@ import numpy as np
 import pycolmap
 from synthetic_colmap import TRUE, make
 
+from hodge_adapters.colmap.content import read_reconstruction
 from hodge_pipeline import se3
 
 KINDS = ("given", "noise", "big", "wrong", "carried", "halves", "renamed", "no_images", "no_database")
@@ -117,7 +118,7 @@ def beside(good: Path, kind: str) -> list[str]:
 
 def disturbed(good: Path, out: Path, kind: str, seed: int) -> list[Path]:
     """The folders of the disturbed model; points, tracks and cameras stay."""
-    rng, model = np.random.default_rng(seed), pycolmap.Reconstruction(good)
+    rng, model = np.random.default_rng(seed), read_reconstruction(good)
     ids = sorted(model.reg_image_ids())
     size = extent(model)
     if kind == "halves":
@@ -136,7 +137,7 @@ def disturbed(good: Path, out: Path, kind: str, seed: int) -> list[Path]:
             turn = rng.normal(size=3) * np.deg2rad(degrees) / 3**0.5
             _move(model, image_id, turn, rng.normal(size=3) * share * size / 3**0.5)
     if kind == "carried":
-        _carry(model, pycolmap.Reconstruction(good))
+        _carry(model, read_reconstruction(good))
     if kind == "renamed":
         for image in model.images.values():
             image.name = f"other/{image.name}"
@@ -148,7 +149,7 @@ def disturbed(good: Path, out: Path, kind: str, seed: int) -> list[Path]:
 def _halves(good: Path, ids: Sequence[int], out: Path, rng: np.random.Generator) -> Iterator[Path]:
     count, both = len(ids), max(2, len(ids) // 6)
     for number, keep in enumerate((ids[: count // 2 + both // 2 + 1], ids[count // 2 - both // 2 :])):
-        half = pycolmap.Reconstruction(good)
+        half = read_reconstruction(good)
         for image_id in set(ids) - set(keep):
             half.deregister_frame(half.images[image_id].frame_id)
         turn = pycolmap.Rotation3d(se3.so3_exp(rng.normal(size=3)))
@@ -183,7 +184,7 @@ def extent(model: pycolmap.Reconstruction) -> float:
 
 def compared(good: Path, other: Path, kind: str) -> tuple[float, float]:
     """Centres in % of the good model's extent after a similarity, and the median reprojection error in pixels."""
-    there, here = pycolmap.Reconstruction(good), pycolmap.Reconstruction(other)
+    there, here = read_reconstruction(good), read_reconstruction(other)
     prefix = "other/" if kind == "renamed" else ""
     known = {prefix + there.images[key].name: there.images[key].projection_center() for key in there.reg_image_ids()}
     pairs = [(here.images[key].projection_center(), known[here.images[key].name]) for key in here.reg_image_ids()]
