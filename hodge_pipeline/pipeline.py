@@ -22,7 +22,7 @@ from hodge_pipeline.rounds.all_frames import pose_all_frames
 from hodge_pipeline.rounds.by_hand import edited_rounds
 from hodge_pipeline.rounds.one_round import Registered, Work
 from hodge_pipeline.rounds.suggested import suggested_rounds
-from hodge_pipeline.run_folder import begin, opening_of
+from hodge_pipeline.run_folder import begin
 from hodge_pipeline.scene import Round, Scene
 from hodge_pipeline.sources.measured_edges import measured_edges
 from hodge_pipeline.start.known_positions import known_fixes
@@ -60,7 +60,7 @@ def compute(job: Job, recording: Recording) -> Computed:
     recipe, store = job.recipe, job.store
     with open_workers(recipe.executor, job.dask) as workers:
         scene = recipe.start.begin(job.source, recipe.clouds, store, workers)
-        store.step(begin, *opening_of(scene), title="frames")
+        store.step(begin, scene.whole, scene.key_frames, scene.first, title="frames")
         recording.begin(scene.source, scene.clouds, scene.first)
         fixes = known_fixes(scene, recipe.positions, store)
         work = Work(recipe, store, scene, measured(job, scene), workers, fixes)

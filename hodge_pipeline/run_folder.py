@@ -21,7 +21,7 @@ from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.notebook import as_html
 from hodge_pipeline.rounds.all_frames import pose_frames
 from hodge_pipeline.rounds.one_round import solve_edges
-from hodge_pipeline.scene import KeyFrames, Round, Scene, given_poses, true_poses
+from hodge_pipeline.scene import KeyFrames, Round, given_poses, true_poses
 from hodge_pipeline.sources.opening import open_with_reader
 from hodge_pipeline.stages import FrameReader, Step
 from hodge_pipeline.store.store import stored, stored_clouds
@@ -256,11 +256,6 @@ def begin(source: Source, key_frames: KeyFrames, first: Round, *, step: Step) ->
 def end(world_from_cam: Floats, report: Report, refined: Refined | None, *, step: Step) -> Ending:
     """Step: what a run ends with, kept."""
     return Ending(world_from_cam, report, refined)
-
-
-def opening_of(scene: Scene) -> tuple[Source, KeyFrames, Round]:
-    """The inputs of `begin`."""
-    return scene.whole, scene.key_frames, scene.first
 
 
 def check_layout(folder: Path) -> None:

@@ -9,13 +9,13 @@ import numpy as np
 from hodge_adapters.images.camera_files import read_intrinsics
 from hodge_adapters.images.frames import (
     Lens,
-    encoded_undistorted_colour,
     encoded_undistorted_depth,
+    undistorted,
     undistorted_colour,
     undistorted_depth,
 )
 from hodge_adapters.tum.reader import CAMERAS, TumReader
-from hodge_pipeline.types import Camera, Floats32
+from hodge_pipeline.types import Camera, Floats32, Frame
 
 CAMERA = Camera(640, 480, 517.3, 516.5, 318.6, 255.3)
 FR1 = CAMERAS["fr1"].distortion
@@ -52,7 +52,10 @@ def test_encoded_images_are_the_straight_ones() -> None:
     depth = encoded_undistorted_depth(partial(dot, 300, 200), LENS, 5000.0)
     stored = cv2.imdecode(np.frombuffer(depth.contents, np.uint8), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(stored / 5000.0, undistorted_depth(partial(dot, 300, 200), LENS))
-    colour = encoded_undistorted_colour(lambda: np.full((480, 640, 3), (200, 10, 10), np.uint8), LENS)
+    seen = Frame(0, 0.0, LENS.camera, read_colour=lambda: np.full((480, 640, 3), (200, 10, 10), np.uint8))
+    encoded_colour = undistorted(seen, LENS, 5000.0).encoded_colour
+    assert encoded_colour is not None
+    colour = encoded_colour()
     middle = cv2.imdecode(np.frombuffer(colour.contents, np.uint8), cv2.IMREAD_COLOR)[240, 320]
     np.testing.assert_allclose(middle, (10, 10, 200), atol=4)
 

@@ -38,9 +38,9 @@ class Contents:
         return any(path == parent or path.startswith(f"{parent}/") for path in self.entities)
 
 
-def make_blueprint(contents: Contents, eyes: Eyes, active_tab: int = 0) -> rrb.Blueprint:
+def make_blueprint(contents: Contents, eyes: Eyes) -> rrb.Blueprint:
     """The default blueprint: a tab for each part of the run that is there, the story first."""
-    return without_panels(rrb.Tabs(*make_tabs(contents, eyes), active_tab=active_tab), layout.STORY)
+    return without_panels(rrb.Tabs(*make_tabs(contents, eyes), active_tab=0), layout.STORY)
 
 
 def without_panels(root: rrb.Container, timeline: str) -> rrb.Blueprint:

@@ -16,12 +16,12 @@ from hodge_pipeline.recording.eye import Eyes, look_at, look_from, points_of
 from hodge_pipeline.recording.stream import log_markdown, writing
 
 
-def merge(parts: Iterable[Path], out: Path, recording_id: str, *, active_tab: int = 0) -> None:
-    """One file of these parts, in the order of the run that their names say; it opens on a tab, the story."""
+def merge(parts: Iterable[Path], out: Path, recording_id: str) -> None:
+    """One file of these parts, in the order of the run that their names say; it opens on the story."""
     parts = sorted(parts, key=lambda part: part.name)
     readers = readers_of(parts)
     contents = with_entities(contents_of(parts), readers.values())
-    blueprint = make_blueprint(contents, eyes(contents, readers.values()), active_tab)
+    blueprint = make_blueprint(contents, eyes(contents, readers.values()))
     with writing(out, recording_id, blueprint) as stream:
         for reader in readers.values():
             send(stream, reader, layout.poses(contents.trajectory))

@@ -74,13 +74,14 @@ def _image_file(path: Path, camera: Camera, lens: Lens | None) -> ImageFile:
 
 def undistorted(frame: Frame, lens: Lens, units_per_metre: float) -> Frame:
     """The frame with its depth and colour undistorted; depth is encoded in these units."""
-    depth, colour = frame.read_depth, frame.read_colour
+    depth = frame.read_depth
+    colour = partial(undistorted_colour, frame.read_colour, lens) if frame.read_colour else None
     return replace(
         frame,
         read_depth=partial(undistorted_depth, depth, lens) if depth else None,
         encoded_depth=partial(encoded_undistorted_depth, depth, lens, units_per_metre) if depth else None,
-        read_colour=partial(undistorted_colour, colour, lens) if colour else None,
-        encoded_colour=partial(encoded_undistorted_colour, colour, lens) if colour else None,
+        read_colour=colour,
+        encoded_colour=partial(as_jpeg, colour) if colour else None,
     )
 
 
@@ -122,20 +123,15 @@ def encoded_undistorted_depth(read: Callable[[], Floats32], lens: Lens, units_pe
     return EncodedImage(encoded_depth(stored) or _encoded(".png", stored, []), "image/png", units_per_metre)
 
 
-def encoded_undistorted_colour(read: Callable[[], Bytes], lens: Lens) -> EncodedImage:
-    """The undistorted colour image as JPEG."""
-    return as_jpeg(undistorted_colour(read, lens))
-
-
 def encoded_colour(path: Path, size: tuple[int, int]) -> EncodedImage:
     """The file's bytes untouched where it has the camera's (width, height), else the image of that size as JPEG."""
     fits = pixels.image_size(path) == size
-    return pixels.encoded(path) if fits else as_jpeg(pixels.read_colour(path, size=size))
+    return pixels.encoded(path) if fits else as_jpeg(partial(pixels.read_colour, path, size=size))
 
 
-def as_jpeg(image: Bytes) -> EncodedImage:
-    """A colour image (H, W, 3) as JPEG."""
-    contents = _encoded(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+def as_jpeg(read: Callable[[], Bytes]) -> EncodedImage:
+    """The colour image (H, W, 3) that `read` gives, as JPEG."""
+    contents = _encoded(".jpg", cv2.cvtColor(read(), cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return EncodedImage(contents, "image/jpeg")
 
 

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from hodge_adapters.images import pixels
-from hodge_adapters.images.frames import Lens, as_jpeg, undistorted_colour
-from hodge_pipeline.types import Bytes, Camera, EncodedImage, Floats32
+from hodge_adapters.images.frames import Lens, undistorted_colour
+from hodge_pipeline.types import Bytes, Camera, Floats32
 
 ASSUMED_DEPTH_M = 2.0
 """Depth that an image without any is taken to have."""
@@ -76,10 +76,3 @@ def read_on_depth_pixels(
     if image.shape[1::-1] != size:
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     return on_depth_pixels(image, read_depth(), camera, second)
-
-
-def encoded_on_depth_pixels(
-    read: Callable[[], Bytes], read_depth: Callable[[], Floats32], camera: Camera, second: SecondCamera
-) -> EncodedImage:
-    """The image of `read_on_depth_pixels` as JPEG."""
-    return as_jpeg(read_on_depth_pixels(read, read_depth, camera, second))

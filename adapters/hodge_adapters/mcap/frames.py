@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
-from hodge_adapters.images.frames import Lens, undistorted
-from hodge_adapters.images.second_camera import SecondCamera, encoded_on_depth_pixels, read_on_depth_pixels
+from hodge_adapters.images.frames import Lens, as_jpeg, undistorted
+from hodge_adapters.images.second_camera import SecondCamera, read_on_depth_pixels
 from hodge_adapters.mcap.clouds import CloudLayout, read_points
 from hodge_adapters.mcap.images import UNITS_PER_METRE, ImageLayout, encoded_image, read_colour, read_depth
 from hodge_adapters.mcap.recording import Seen
@@ -71,12 +71,9 @@ def colour_frames(images: Sequence[Seen[ImageLayout]], camera: Camera | None, le
 def _beside(frame: Frame, image: Seen[ImageLayout], second: SecondCamera) -> Frame:
     """The frame with colour of a camera beside that of its depth, on the pixels of depth."""
     assert frame.read_depth is not None and frame.camera is not None
-    given = partial(read_colour, image.payload, image.layout), frame.read_depth, frame.camera, second
-    return replace(
-        frame,
-        read_colour=partial(read_on_depth_pixels, *given),
-        encoded_colour=partial(encoded_on_depth_pixels, *given),
-    )
+    seen = partial(read_colour, image.payload, image.layout)
+    colour = partial(read_on_depth_pixels, seen, frame.read_depth, frame.camera, second)
+    return replace(frame, read_colour=colour, encoded_colour=partial(as_jpeg, colour))
 
 
 def _encoded_colour(image: Seen[ImageLayout] | None) -> Callable[[], EncodedImage] | None:

@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from hodge_adapters.images import pixels
-from hodge_adapters.images.frames import as_jpeg
 from hodge_adapters.images.second_camera import SecondCamera, on_depth_pixels
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Bytes, Camera, EncodedImage, Floats, Floats32
+from hodge_pipeline.types import Bytes, Camera, Floats, Floats32
 from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.image_edges import FEWEST_EDGES, change_along_rows, depth_edges
 
@@ -102,11 +101,6 @@ def read_registered_colour(path: Path, depth: DepthFile) -> Bytes:
     image = pixels.read_colour(path, size=depth.size)
     depth_m = _read_last(depth, _changed(depth.path))
     return on_depth_pixels(image, depth_m, depth.camera, kinect_colour_camera(depth.camera))
-
-
-def encoded_registered_colour(path: Path, depth: DepthFile) -> EncodedImage:
-    """The image of `read_registered_colour` as JPEG."""
-    return as_jpeg(read_registered_colour(path, depth))
 
 
 def read_depth(depth: DepthFile) -> Floats32:

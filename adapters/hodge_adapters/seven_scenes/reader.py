@@ -20,10 +20,9 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
-from hodge_adapters.images.frames import image_frame
+from hodge_adapters.images.frames import as_jpeg, image_frame
 from hodge_adapters.seven_scenes.colour import (
     DepthFile,
-    encoded_registered_colour,
     is_unregistered,
     read_depth,
     read_registered_colour,
@@ -193,12 +192,13 @@ class SevenScenesReader:
         )
         if not is_unregistered or "color" not in files.paths:
             return frame
-        colour, depth = files.paths["color"], self._depth(files, camera)
+        depth = self._depth(files, camera)
+        colour = partial(read_registered_colour, files.paths["color"], depth)
         return replace(
             frame,
             read_depth=partial(read_depth, depth),
-            read_colour=partial(read_registered_colour, colour, depth),
-            encoded_colour=partial(encoded_registered_colour, colour, depth),
+            read_colour=colour,
+            encoded_colour=partial(as_jpeg, colour),
             image=None,
         )
 
