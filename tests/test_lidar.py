@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hodge_adapters.clouds.columns import seconds_after_first
-from hodge_adapters.clouds.pcd import read_pcd
+from hodge_adapters.clouds.fragments import Fragment, read_fragment
 from hodge_adapters.clouds.ply import write_ply
 from hodge_adapters.clouds.reader import CloudFolderReader
 from hodge_pipeline import se3
@@ -65,7 +65,7 @@ def test_times_come_with_the_points_of_a_pcd(tmp_path: Path) -> None:
         "DATA binary\n"
     )
     (tmp_path / "0.pcd").write_bytes(header.encode() + points.tobytes())
-    cloud = read_pcd(tmp_path / "0.pcd")
+    cloud = read_fragment(Fragment(tmp_path / "0.pcd"))
     assert cloud.times_s == pytest.approx([0.0, 0.08, 0.1]) and len(cloud) == 3
     read = CloudFolderReader(units_per_metre=1000).open(tmp_path).frames[0].read_points
     assert read is not None and read().times_s == pytest.approx([0.0, 0.08, 0.1])  # in millimetres too
@@ -266,7 +266,7 @@ def test_organised_clouds_with_holes_are_followed_and_none_that_no_poses_pair_is
 ) -> None:
     folder, road, described = tmp_path / "sweeps", Road(10.0), list[int]()
 
-    def describe(clouds: Path, registrar: object, rows: Ints, **_: object) -> None:
+    def describe(clouds: Path, registrar: object, rows: Ints, *_: object) -> None:
         described.extend(rows.tolist())
 
     monkeypatch.setattr("hodge_pipeline.start.unordered.start.describe_clouds", describe)
