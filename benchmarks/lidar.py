@@ -20,7 +20,7 @@ import numpy as np
 import open3d as o3d
 
 import hodge_pipeline
-from hodge_adapters.clouds.pcd import read_pcd
+from hodge_adapters.clouds.fragments import Fragment, read_fragment
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import make_sequence
 from hodge_pipeline.demo.street import Road
@@ -82,7 +82,7 @@ def kiss_icp(files: list[Path]) -> Outcome:
     config.registration.max_num_threads = 1
     begin, tracker, poses = time.process_time(), KissICP(config), []
     for file in files:
-        cloud = read_pcd(file)
+        cloud = read_fragment(Fragment(file))
         assert cloud.times_s is not None
         tracker.register_frame(cloud.points_in_cam.astype(float), cloud.times_s / cloud.times_s.max())
         poses.append(np.array(tracker.last_pose))
@@ -130,7 +130,7 @@ def multiway(files: list[Path]) -> Outcome:
 
 
 def _open3d_cloud(file: Path) -> o3d.geometry.PointCloud:
-    points = o3d.utility.Vector3dVector(read_pcd(file).points_in_cam.astype(float))
+    points = o3d.utility.Vector3dVector(read_fragment(Fragment(file)).points_in_cam.astype(float))
     cloud = o3d.geometry.PointCloud(points).voxel_down_sample(VOXEL_M)
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=4 * VOXEL_M, max_nn=30))
     return cloud

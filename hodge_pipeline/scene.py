@@ -270,13 +270,12 @@ def own_trajectory(source: Source) -> Trajectory | None:
 
     Raises `SourceError` where frames of several sequences have stamps that repeat.
     """
-    posed = [(frame.stamp_s, frame.world_from_cam) for frame in source.frames if frame.world_from_cam is not None]
-    if source.trajectory is not None or not posed:
+    if source.trajectory is not None:
         return source.trajectory
-    stamps = np.array([stamp for stamp, _ in posed])
-    if (np.diff(stamps) <= 0).any():
+    found = Trajectory.of_frames(source.frames)
+    if found is not None and (np.diff(found.stamps_s) <= 0).any():
         raise SourceError(f"{source.path}: several sequences with stamps of their own: give one sequence's folder")
-    return Trajectory(stamps, np.array([pose for _, pose in posed]))
+    return found
 
 
 def _filled(poses: Floats, found: Bools, times: Floats) -> Floats:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hodge_adapters.clouds.ply import read_ply as read_points
+from hodge_adapters.clouds.fragments import Fragment, read_fragment
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Model
 from hodge_pipeline.types.output_files import replacing
@@ -108,7 +108,7 @@ def test_the_points_of_a_model_are_read_as_those_of_a_scan(tmp_path: Path) -> No
     """One codec: what fusion wrote is a scan for the next run, whatever element follows the vertices."""
     model = model_of(40, triangles=7)
     write_ply(tmp_path / "x.ply", model)
-    found = read_points(tmp_path / "x.ply")
+    found = read_fragment(Fragment(tmp_path / "x.ply"))
     np.testing.assert_array_equal(found.points_in_cam, model.points_in_world)
     np.testing.assert_array_equal(found.colours, model.colours)
     cut = (tmp_path / "x.ply").read_bytes()[:-1]

@@ -253,7 +253,7 @@ def test_violation_is_the_worse_of_the_two_views() -> None:
 
 
 def test_real_fragments_are_registered_with_no_guess(data_dir: Path) -> None:
-    from hodge_adapters.clouds.ply import read_ply
+    from hodge_adapters.clouds.fragments import Fragment, read_fragment
     from hodge_adapters.trajectories.log import read_log_file
 
     fragments = data_dir / "fragments"
@@ -261,7 +261,8 @@ def test_real_fragments_are_registered_with_no_guess(data_dir: Path) -> None:
     wanted = truth.i_from_j[np.flatnonzero((truth.pairs == (1, 3)).all(axis=1))[0]]
     registrar = FpfhConsensus()
     described = [
-        registrar.describe(read_ply(fragments / f"redkitchen_3dmatch/cloud_bin_{number}.ply")) for number in (1, 3)
+        registrar.describe(read_fragment(Fragment(fragments / f"redkitchen_3dmatch/cloud_bin_{number}.ply")))
+        for number in (1, 3)
     ]
     found = registrar.match(*described)
     metres, degrees = off_by(found.i_from_j, wanted)

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from hodge_adapters.clouds.pcd import MAX_EXPANDED_BYTES, read_pcd
-from hodge_adapters.clouds.ply import read_ply
+from hodge_adapters.clouds.fragments import Fragment, read_fragment
+from hodge_adapters.clouds.pcd import MAX_EXPANDED_BYTES
 from hodge_adapters.colmap.database import database_names
 from hodge_adapters.mcap.records import MAGIC
 from hodge_pipeline.errors import SourceError
@@ -146,10 +146,10 @@ def test_counts_of_a_ply_are_not_believed(header: str, tmp_path: Path) -> None:
     path.write_text(f"{header}{coordinates}end_header\n1 2 3\n")
     start = time.process_time()
     with pytest.raises(SourceError, match="copy it again"):
-        read_ply(path)
+        read_fragment(Fragment(path))
     path.write_text(f"{header}end_header\n1 2 3\n")
     with pytest.raises(SourceError):
-        read_ply(path)
+        read_fragment(Fragment(path))
     assert time.process_time() - start < AT_ONCE_CPU_S
 
 
@@ -158,7 +158,7 @@ def test_a_pcd_expands_no_further_than_it_may(tmp_path: Path) -> None:
     head = f"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nPOINTS {count}\nDATA binary_compressed\n"
     path.write_bytes(head.encode() + struct.pack("<II", 1 << 23, 12 * count) + bytes(1 << 23))
     with pytest.raises(SourceError, match="expands to .* the limit is"):
-        read_pcd(path)
+        read_fragment(Fragment(path))
 
 
 HOSTILE_TABLES = {

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from clouds_data import cloud
 from hodge_adapters.clouds import columns as point_columns
-from hodge_adapters.clouds.pcd import expand_lzf, read_pcd
-from hodge_adapters.clouds.ply import read_ply, write_ply
+from hodge_adapters.clouds.fragments import Fragment, read_fragment
+from hodge_adapters.clouds.pcd import expand_lzf
+from hodge_adapters.clouds.ply import write_ply
 from hodge_adapters.clouds.reader import CloudFolderReader
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.testing import check_reader
@@ -54,13 +55,13 @@ def test_big_endian_ply_after_another_element(tmp_path: Path) -> None:
     header = "ply\r\nformat binary_big_endian 1.0\r\nelement camera 2\r\nproperty short a\r\nelement vertex 1\r\n"
     header += "property double x\r\nproperty float y\r\nproperty float z\r\nend_header\r\n"
     (tmp_path / "a.ply").write_bytes(header.encode() + struct.pack(">hhdff", 7, 8, 1.5, 2.5, 3.5))
-    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").points_in_cam, [[1.5, 2.5, 3.5]])
+    np.testing.assert_array_equal(read_fragment(Fragment(tmp_path / "a.ply")).points_in_cam, [[1.5, 2.5, 3.5]])
 
 
 def test_points_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
     text = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 3\nHEIGHT 1\nPOINTS 3\nDATA ascii\n"
     (tmp_path / "a.pcd").write_text(text + "1 2 3\nnan nan nan\n4 5 inf\n")
-    np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd").points_in_cam, [[1, 2, 3]])
+    np.testing.assert_array_equal(read_fragment(Fragment(tmp_path / "a.pcd")).points_in_cam, [[1, 2, 3]])
 
 
 @given(seed=st.integers(0, 1000))
@@ -68,7 +69,7 @@ def test_points_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
 def test_written_ply_is_read_to_the_last_bit(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     path = tmp_path_factory.mktemp("ply") / "a.ply"
     write_ply(path, cloud(seed=seed))
-    found = read_ply(path)
+    found = read_fragment(Fragment(path))
     np.testing.assert_array_equal(found.points_in_cam, cloud(seed=seed).points_in_cam)
     theirs = o3d.io.read_point_cloud(str(path))
     np.testing.assert_array_equal(np.asarray(theirs.points), found.points_in_cam)
@@ -136,12 +137,11 @@ def test_files_are_read_in_parts_as_they_are_whole(tmp_path: Path, monkeypatch: 
         made = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(expected.points_in_cam.astype(float)))
         made.colors = o3d.utility.Vector3dVector(expected.colours / 255.0)  # type: ignore[operator]
         o3d.io.write_point_cloud(str(path), made, write_ascii=ascii_text)
-        read = {"ply": read_ply, "pcd": read_pcd}[kind]
-        whole = read(path)
+        whole = read_fragment(Fragment(path))
         monkeypatch.setattr(point_columns, "LINES_IN_PART", 7)
         monkeypatch.setattr(point_columns, "ROWS_IN_PART", 9)
         monkeypatch.setattr(ply, "ROWS_IN_PART", 9)
-        parts = read(path)
+        parts = read_fragment(Fragment(path))
         monkeypatch.undo()
         assert np.array_equal(whole.points_in_cam, parts.points_in_cam) and len(parts) == 50
         assert np.array_equal(whole.colours, parts.colours)  # type: ignore[arg-type]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from clouds_data import cloud, fragments, log_block
-from hodge_adapters.clouds.ply import read_ply
+from hodge_adapters.clouds.fragments import Fragment, read_fragment
 from hodge_adapters.clouds.reader import CloudFolderReader, PlyWriter
 from hodge_adapters.trajectories.log import read_log_file
 from hodge_pipeline import se3
@@ -67,7 +67,7 @@ def test_one_cloud_of_all_fragments(tmp_path: Path) -> None:
     poses = some_poses(2)
     (folder / "poses.log").write_text(log_block(0, 0, poses[0]) + log_block(5, 5, poses[1]))
     PlyWriter().write(tmp_path / "all.ply", CloudFolderReader().open(folder))
-    found = read_ply(tmp_path / "all.ply")
+    found = read_fragment(Fragment(tmp_path / "all.ply"))
     expected = [se3.transform(pose, cloud(seed=k).points_in_cam) for k, pose in enumerate(poses)]
     np.testing.assert_allclose(found.points_in_cam, np.concatenate(expected), atol=1e-5)
     with pytest.raises(SourceError, match="no frame with points"):
@@ -139,7 +139,7 @@ def test_points_of_a_far_frame_are_written_from_whole_kilometres(tmp_path: Path)
     told = PlyWriter().write(tmp_path / "out.ply", replace(source, frames=frames))
     assert "points lie far from zero: they are counted from 500000 5400000 0" in told
     expected = cloud(seed=0).points_in_cam + FAR[0] - [500_000, 5_400_000, 0]
-    np.testing.assert_allclose(read_ply(tmp_path / "out.ply").points_in_cam, expected, atol=1e-4)
+    np.testing.assert_allclose(read_fragment(Fragment(tmp_path / "out.ply")).points_in_cam, expected, atol=1e-4)
 
 
 def test_tables_of_something_else_are_no_scans_and_told(tmp_path: Path) -> None:

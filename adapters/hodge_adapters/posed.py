@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 
 import numpy as np
 
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Floats, Frame, Source, Trajectory, ViewGraph
+from hodge_pipeline.types import Floats, Source, Trajectory, ViewGraph
 from hodge_pipeline.types.text import counted
 
 UNIT_TOLERANCE = 1e-3
@@ -28,7 +28,7 @@ def trajectory_of(source: Source) -> Trajectory:
     """The source's trajectory, else the poses of its frames. Raises `SourceError` where it has neither."""
     if source.trajectory is not None:
         return source.trajectory
-    found = posed_frames(source.frames)
+    found = Trajectory.of_frames(source.frames)
     if found is None:
         raise SourceError(f"{source.path}: has no poses to write: convert one that has a trajectory")
     return found
@@ -81,9 +81,3 @@ def left_out(no_numbers: int) -> tuple[str, ...]:
 
 def _stamps(trajectory: Trajectory | None) -> Floats:
     return np.zeros(0) if trajectory is None else trajectory.stamps_s
-
-
-def posed_frames(frames: Sequence[Frame]) -> Trajectory | None:
-    """The poses of the frames that have one, as a trajectory; None where none has."""
-    posed = [(frame.stamp_s, frame.world_from_cam) for frame in frames if frame.world_from_cam is not None]
-    return Trajectory(np.array([stamp for stamp, _ in posed]), np.array([pose for _, pose in posed])) if posed else None

@@ -124,6 +124,12 @@ class Trajectory:
     world_from_cam: Floats
     has_stamps: bool = True
 
+    @classmethod
+    def of_frames(cls, frames: Sequence[Frame]) -> Trajectory | None:
+        """The poses of the frames that have one, in their order; None where none has."""
+        posed = [(frame.stamp_s, frame.world_from_cam) for frame in frames if frame.world_from_cam is not None]
+        return cls(np.array([stamp for stamp, _ in posed]), np.array([pose for _, pose in posed])) if posed else None
+
     def __len__(self) -> int:
         return len(self.stamps_s)
 

@@ -45,8 +45,11 @@ class Fragment:
         return pose
 
 
-def read_fragment(fragment: Fragment, *, units_per_metre: float, raise_deg: float = 0.0) -> PointCloud:
-    """The points of a fragment in metres, by the ending of its file; those of a `.bin` raised by an angle."""
+def read_fragment(fragment: Fragment, *, units_per_metre: float = 1.0, raise_deg: float = 0.0) -> PointCloud:
+    """The points of a fragment in metres, by the ending of its file; those of a `.bin` raised by an angle.
+
+    Points that are not finite are left out. Raises `SourceError` for a damaged file, and for one without x, y, z.
+    """
     ending = fragment.path.suffix.lower()
     if ending in WHOLE:
         cloud = WHOLE[ending](fragment.path)

@@ -17,13 +17,11 @@ from hodge_adapters.clouds.columns import (
     as_declared,
     number_rows,
     parts_of,
-    points_of_parts,
     refuse_more,
     unpacked,
 )
 from hodge_adapters.text_rows import reading
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import PointCloud
 from hodge_pipeline.types.input_files import beginning, read_input
 
 MAX_HEADER_BYTES = 1 << 14
@@ -49,16 +47,8 @@ class PcdHeader:
         return np.dtype([(name, code, (count,)) if count > 1 else (name, code) for name, code, count in self.fields])
 
 
-def read_pcd(path: Path) -> PointCloud:
-    """The points, with normals and colours where they have them; those that are not finite are left out.
-
-    Raises `SourceError` for a damaged header, for one that promises more than there is, for no x, y, z.
-    """
-    return points_of_parts(path, pcd_parts(path))
-
-
 def pcd_parts(path: Path) -> Iterator[dict[str, Any]]:
-    """The same as columns, in parts."""
+    """The points as columns, in parts. Raises `SourceError` for a damaged header, or one that promises too much."""
     with reading(path):
         contents = read_input(path)
     header = _read_header(path, contents)

@@ -7,7 +7,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from hodge_adapters.clouds.columns import as_declared, number_rows, points_of_parts, refuse_more
+from hodge_adapters.clouds.columns import as_declared, number_rows, refuse_more
 from hodge_adapters.text_rows import reading, write_bytes_atomically
 from hodge_pipeline.types import Model, PointCloud
 from hodge_pipeline.types.input_files import open_input
@@ -23,16 +23,8 @@ COLOURS = {
 }
 
 
-def read_ply(path: Path) -> PointCloud:
-    """The vertices, with normals and colours where they have them; points that are not finite are left out.
-
-    Raises `SourceError` for a damaged header, for one that promises more than there is, for no x, y, z.
-    """
-    return points_of_parts(path, ply_parts(path))
-
-
 def ply_parts(path: Path) -> Iterator[dict[str, Any]]:
-    """The same as columns, in parts."""
+    """The vertices as columns, in parts. Raises `SourceError` for a damaged header, or one that promises too much."""
     with reading(path), open_input(path) as file:
         header = read_header(path, file)
         parts = _binary_parts if header.order else _ascii_parts

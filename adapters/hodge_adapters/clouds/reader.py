@@ -20,14 +20,14 @@ from hodge_adapters.clouds.ply import write_ply
 from hodge_adapters.clouds.scan_files import LIBRARIES, library
 from hodge_adapters.clouds.tables import names_points
 from hodge_adapters.clouds.uos import POSE, pose_file
-from hodge_adapters.posed import left_out, posed_frames, written
+from hodge_adapters.posed import left_out, written
 from hodge_adapters.text_rows import listed, natural
 from hodge_adapters.trajectories.log import begins_as_log, read_log_file
 from hodge_adapters.trajectories.text import unit_of
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
-from hodge_pipeline.types import Floats, Floats32, Frame, PointCloud, Source, ViewGraph
+from hodge_pipeline.types import Floats, Floats32, Frame, PointCloud, Source, Trajectory, ViewGraph
 from hodge_pipeline.types.positions import whole_kilometres
 from hodge_pipeline.types.text import counted
 
@@ -113,7 +113,7 @@ class CloudFolderReader:
         graph = _graph(names, parsed.pairs, parsed.i_from_j, notes) if parsed and len(parsed.pairs) else None
         every = frames[:: self.every]
         read = (*files, *beside)
-        return Source(path.resolve().name, path, every, posed_frames(frames), graph, tuple(notes), read)
+        return Source(path.resolve().name, path, every, Trajectory.of_frames(frames), graph, tuple(notes), read)
 
     def _files(self, path: Path, notes: list[str]) -> list[Path]:
         try:

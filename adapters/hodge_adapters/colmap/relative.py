@@ -10,6 +10,7 @@ from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import matrix_of
 from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types.arrays import evenly
 
 MAX_ERROR_PX = 4.0
 LEAST_ERROR_PX = 0.25
@@ -84,7 +85,7 @@ def by_structure(sighting: Sighting, min_inliers: int, seed: int) -> tuple[Relat
     No ambiguity of two views is left, nor of their distance; it is as right as the points are to each other.
     """
     count = len(sighting.pixels_i)
-    rows = np.unique(np.linspace(0, count - 1, min(count, START_MATCHES)).round().astype(np.int64))
+    rows = evenly(count, START_MATCHES)
     if not np.isfinite(sighting.xyz).all():
         return None
     options = pycolmap.AbsolutePoseEstimationOptions()
@@ -140,7 +141,7 @@ def _start(sighting: Sighting, seed: int) -> Floats | None:
         options.ransac.random_seed = seed
         options.ransac.max_error = MAX_ERROR_PX
         count = len(sighting.pixels_i)
-        rows = np.unique(np.linspace(0, count - 1, min(count, START_MATCHES)).round().astype(np.uint32))
+        rows = evenly(count, START_MATCHES).astype(np.uint32)
         matches = np.column_stack([rows, rows])
         geometry = pycolmap.estimate_calibrated_two_view_geometry(*cameras_and_pixels, matches, options)
     found = pycolmap.estimate_two_view_geometry_pose(*cameras_and_pixels, geometry)

@@ -15,6 +15,7 @@ from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import Model, Points, matrix_of
 from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types.arrays import evenly
 
 LEAST_INLIERS = 12
 """Points; below it a wrong pose may have as many."""
@@ -39,8 +40,7 @@ def resected(model: Model, bodies: Bodies, chosen: Bools | None = None) -> Float
     ends = np.searchsorted(body[order], np.arange(len(out) + 1))
     for number in range(len(out)) if chosen is None else np.flatnonzero(chosen):
         rows = order[ends[number] : ends[number + 1]]
-        if len(rows) > MOST_POINTS:
-            rows = rows[np.linspace(0, len(rows) - 1, MOST_POINTS).round().astype(np.int64)]
+        rows = rows[evenly(len(rows), MOST_POINTS)]
         pose = _placed(model, bodies, rows) if len(rows) >= LEAST_INLIERS else None
         if pose is not None:
             out[number] = pose

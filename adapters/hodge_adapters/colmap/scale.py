@@ -16,6 +16,7 @@ from hodge_adapters.images.lens_models import HALF_PIXEL
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Floats32, ViewGraph
+from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.text import counted
 
 SAMPLED_IMAGES = 12
@@ -114,7 +115,7 @@ def seen_depths(
 def _evenly(sensors: Mapping[int, Path], most: int) -> list[int]:
     """At most so many of the rows, evenly."""
     rows = sorted(sensors)
-    return [rows[at] for at in np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int))]
+    return [rows[at] for at in evenly(len(rows), most)]
 
 
 def _read(

@@ -26,7 +26,6 @@ from hodge_adapters.icl_nuim.pov import list_pov, pov_frames
 from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
 from hodge_adapters.images.fitted_camera import UNSTAMPED_STEP_S, assumed_camera_doubts
-from hodge_adapters.posed import posed_frames
 from hodge_adapters.text_rows import first_text
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_adapters.tum.image_lists import (
@@ -37,7 +36,7 @@ from hodge_adapters.tum.image_lists import (
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
-from hodge_pipeline.types import Floats, Frame, Source
+from hodge_pipeline.types import Floats, Frame, Source, Trajectory
 
 ICL = Intrinsics(481.2, -480.0, 319.5, 239.5, (640, 480))
 REDWOOD = Intrinsics(525.0, 525.0, 319.5, 239.5, (640, 480))
@@ -184,7 +183,7 @@ class IclNuimReader:
             path.resolve().name,
             path,
             every,
-            posed_frames(frames),
+            Trajectory.of_frames(frames),
             notes=tuple(notes),
             files=files,
             numbered_hz=VIDEO_HZ,
@@ -213,7 +212,7 @@ class IclNuimReader:
             path.resolve().name,
             path,
             frames,
-            posed_frames(frames) if true else None,
+            Trajectory.of_frames(frames) if true else None,
             notes=tuple(notes),
             files=files,
             doubts=doubts,

@@ -18,12 +18,15 @@ from hodge_adapters.images.png import decoded
 from hodge_adapters.text_rows import reading
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bytes, EncodedImage, Floats32
+from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.input_files import open_input, read_input
 
 HEADER_BYTES = 1 << 16
 """Where an image's size is looked for: room for the thumbnail that may precede it."""
 SAME_SHAPE = 0.01
 """Relative difference of equal aspect ratios: ScanNet's colour, 1296x968, and depth, 640x480, differ by 0.4 %."""
+SAMPLES = 5
+"""Images by whose headers the common size is told."""
 MAX_IMAGE_BYTES = 1 << 29
 """Twice what 64 megapixels of 16-bit depth and their rows' heads take uncompressed."""
 
@@ -134,11 +137,11 @@ def colour_size(paths: Sequence[Path | None], size: tuple[int, int], notes: list
     return found
 
 
-def common_size(paths: Sequence[Path], samples: int = 5) -> tuple[int, int]:
+def common_size(paths: Sequence[Path]) -> tuple[int, int]:
     """The (width, height) that most of a few evenly spaced images have, so that one odd image does not set it."""
     sizes: Counter[tuple[int, int]] = Counter()
     problem: SourceError | None = None
-    for row in np.unique(np.linspace(0, len(paths) - 1, samples if paths else 0).round().astype(int)):
+    for row in evenly(len(paths), SAMPLES):
         try:
             sizes[image_size(paths[row])] += 1
         except SourceError as error:
