@@ -220,10 +220,12 @@ def pairs_to_register(edges: Edges, vertex_ids: NDArray[np.generic], pairs: Sequ
     return tuple(dict.fromkeys(pair_names(vertex_ids, found)))
 
 
-def joining(vertex_ids: NDArray[np.generic], pairs: Ints, pair: str) -> Bools:
-    """Where (P,) pairs of rows are the vertex ids `a-b`, in either direction; parallel ones all."""
+def joining(vertex_ids: NDArray[np.generic], pairs: Ints, *named: str) -> Bools:
+    """Where (P,) pairs of rows are one of those `named` by their vertex ids `a-b`, in either direction; parallel ones
+    all.
+    """
     names = vertex_ids[pairs].astype(str)
-    hits = [((names == [a, b]) | (names == [b, a])).all(axis=1) for a, b in _cuts(pair)]
+    hits = [((names == [a, b]) | (names == [b, a])).all(axis=1) for name in named for a, b in _cuts(name)]
     return np.asarray(np.any(hits, axis=0) if hits else np.zeros(len(pairs), bool))
 
 

@@ -17,7 +17,7 @@ from hodge_pipeline.rounds.more import Placed, register_more
 from hodge_pipeline.rounds.one_round import EDITED, Registered, Work
 from hodge_pipeline.scene import Round
 from hodge_pipeline.start.unordered.pieces import laid_apart
-from hodge_pipeline.types import Bools, Edges, Floats, ViewGraph
+from hodge_pipeline.types import Edges, Floats, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, HELD_OUT, REJECTED, USED
 from hodge_pipeline.types.notes import Note
 
@@ -46,7 +46,7 @@ def edited_rounds(work: Work, folder: Path, rounds: Sequence[Round]) -> Iterator
         fresh = np.arange(len(registered), len(registered) + len(new))
     _tell(work, edges.select(edges.status != HELD_OUT), ids, history)
     start = _start(work, edges.as_graph(ids, edges.counts), rounds)
-    yield Registered(EDITED, edges, fresh, before, start, edges.counts & _any_joining(edges, ids, history.right))
+    yield Registered(EDITED, edges, fresh, before, start, edges.counts & joining(ids, edges.pairs, *history.right))
 
 
 def _placed(work: Work, graph: ViewGraph) -> Placed:
@@ -73,17 +73,10 @@ def _start(work: Work, graph: ViewGraph, rounds: Sequence[Round]) -> Floats:
 def _edited(work: Work, registered: Edges, history: History) -> Edges:
     """The table with the status of every pair by its acceptance, then by the edits."""
     edges = Edges.joined([work.accept(registered), Edges.measured(work.measured)])
-    let_in = (edges.status == REJECTED) & _any_joining(edges, work.measured.vertex_ids, history.enabled)
+    let_in = (edges.status == REJECTED) & joining(work.measured.vertex_ids, edges.pairs, *history.enabled)
     edges = edges.put(let_in, status=USED, why="")
-    off = edges.in_graph & _any_joining(edges, work.measured.vertex_ids, history.disabled)
+    off = edges.in_graph & joining(work.measured.vertex_ids, edges.pairs, *history.disabled)
     return edges.put(off, status=DISABLED)
-
-
-def _any_joining(edges: Edges, vertex_ids: NDArray[np.generic], pairs: tuple[str, ...]) -> Bools:
-    found = np.zeros(len(edges), bool)
-    for pair in pairs:
-        found |= joining(vertex_ids, edges.pairs, pair)
-    return found
 
 
 def _tell(work: Work, edges: Edges, vertex_ids: NDArray[np.generic], history: History) -> None:

@@ -134,10 +134,9 @@ def _harmless(report: Report) -> str:
 
 def _edited(path: Path, graph: ViewGraph, edges: Edges) -> Edges:
     """The edges with those disabled that the present edits in the folder disable, and no others."""
+    disabled = read_history(path).disabled if path.is_dir() else ()
     edges = edges.put(edges.status == DISABLED, status=USED)
-    for pair in read_history(path).disabled if path.is_dir() else ():
-        edges = edges.put(joining(graph.vertex_ids, graph.edges, pair), status=DISABLED)
-    return edges
+    return edges.put(joining(graph.vertex_ids, graph.edges, *disabled), status=DISABLED)
 
 
 @dataclass(frozen=True)
