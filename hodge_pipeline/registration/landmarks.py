@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from hodge_pipeline.registration.pixels import back_project, sound_depth
-from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame, Landmarks
+from hodge_pipeline.types import Bytes, Floats, Frame, Landmarks
 
 WIDE_PX, SHRUNK = 640, 0.7
 """An image at least so wide is shrunk first: SIFT begins with it doubled, and finds the finest features where a pixel's
@@ -29,6 +29,7 @@ def find_landmarks(frame: Frame, count: int, min_range_m: float, max_range_m: fl
         return Landmarks.none()
     grey: Bytes = np.asarray(cv2.cvtColor(frame.read_colour(), cv2.COLOR_RGB2GRAY), np.uint8)
     depth = frame.read_depth()
+    pixel_rad = depth.shape[1] / (grey.shape[1] * frame.camera.fx)  # of the colour image, which may be the larger one
     marks = Landmarks.none()
     for contrast in (CONTRAST, FAINT_CONTRAST):
         pixels, descriptors = _features(grey, depth.shape, count, contrast)
@@ -37,15 +38,10 @@ def find_landmarks(frame: Frame, count: int, min_range_m: float, max_range_m: fl
         z, sound = sound_depth(depth, np.round(pixels).astype(np.int64), min_range_m, max_range_m)
         seen = np.column_stack([pixels[sound].astype(np.float32), z[sound]]).astype(float)
         points = back_project(seen, frame.camera).astype(np.float32)
-        marks = Landmarks(points, descriptors[sound], _pixel_rad(len(points), grey, depth, frame.camera))
+        marks = Landmarks(points, descriptors[sound], np.full(len(points), pixel_rad, np.float32))
         if len(marks) >= min(FEW, count):
             break
     return marks
-
-
-def _pixel_rad(count: int, grey: Bytes, depth: Floats32, camera: Camera) -> Floats32:
-    """The angle in radians (n,) that a pixel of the colour image covers, which may be larger than the depth image."""
-    return np.full(count, depth.shape[1] / (grey.shape[1] * camera.fx), np.float32)
 
 
 def _features(grey: Bytes, depth_shape: tuple[int, ...], count: int, contrast: float) -> tuple[Floats, Bytes]:

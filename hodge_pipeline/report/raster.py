@@ -100,15 +100,11 @@ def two(first: PointCloud, second: PointCloud, i_from_j: Floats, tints: Sequence
         Points.of(
             np.asarray(cloud.points_in_cam, np.float32),
             cloud.normals_in_cam,
-            _tinted(len(cloud), tint),
+            np.tile(np.asarray(tint, np.uint8), (len(cloud), 1)),
         )
         for cloud, tint in zip((first, second), tints, strict=True)
     ]
     return Points.joined([parts[0], parts[1].moved(i_from_j)])
-
-
-def _tinted(count: int, tint: Sequence[float]) -> Bytes:
-    return np.tile(np.asarray(tint, np.uint8), (count, 1))
 
 
 def around(scene: Points, world_from_cam: Floats, is_scanner: bool = False) -> dict[str, View]:

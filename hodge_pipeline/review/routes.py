@@ -267,13 +267,13 @@ class EdgePictures:
                 found = edge_pictures(
                     table.graph, poses, np.array([row]), subject.frames, subject.clouds, has_metres=subject.unit == "m"
                 )
-                plots = tuple(_with_title(plot) for one in found for plot in one.plots)
-                self._made[key] = plots
+                # the diagnosis draws at its robust poses
+                titled = (
+                    (plot, plot.title.replace("robust poses say", "solution says"))
+                    for one in found
+                    for plot in one.plots
+                )
+                self._made[key] = tuple(replace(plot, title=title) for plot, title in titled)
                 while len(self._made) > PICTURES_KEPT:
                     self._made.popitem(last=False)
             return self._made[key]
-
-
-def _with_title(plot: Picture) -> Picture:
-    """The picture with the title of what it is drawn at: the diagnosis draws at its robust poses."""
-    return replace(plot, title=plot.title.replace("robust poses say", "solution says"))

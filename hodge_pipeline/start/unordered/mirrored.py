@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline.start.unordered.hypotheses import RIVAL_OVERLAP
-from hodge_pipeline.types import CloudSet, Edges, Floats32, Ints, PointCloud
+from hodge_pipeline.types import CloudSet, Edges, Ints, PointCloud
 
 POORER = 0.5
 """Share of the usual best overlap of a scan below which its reflection is matched: half, since a right scan is often as
@@ -45,9 +45,5 @@ def _is_mirrored(row: int, clouds: CloudSet, edges: Edges, match: Match, scratch
 
 def reflected(cloud: PointCloud) -> PointCloud:
     """The points reflected in x: any other reflection differs from it by a turn."""
-    points, normals = (np.array([-1, 1, 1], np.float32) * each for each in (cloud.points_in_cam, _normals(cloud)))
-    return PointCloud(points, normals)
-
-
-def _normals(cloud: PointCloud) -> Floats32:
-    return np.zeros_like(cloud.points_in_cam) if cloud.normals_in_cam is None else cloud.normals_in_cam
+    across, normals = np.array([-1, 1, 1], np.float32), cloud.normals_in_cam
+    return PointCloud(across * cloud.points_in_cam, None if normals is None else across * normals)
