@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -88,29 +88,28 @@ def _has_table(database: sqlite3.Connection, name: str) -> bool:
     return bool(database.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?", (name,)).fetchone())
 
 
-class PriorRow(NamedTuple):
-    """What COLMAP noted of an image beside its pixels: NaN where it noted nothing.
+class Known(NamedTuple):
+    """Of one image: `position (3,)` in metres and its `covariance (3, 3)`; `gravity (3,)` in its axes; NaN: unknown.
 
-    `position (3,)`: latitude, longitude (degrees) and height where it is geodetic; `gravity (3,)` in the camera's axes.
+    The position is latitude, longitude (degrees) and height (metres) where it is `geodetic`.
     """
 
-    name: str
     position: Floats
     covariance: Floats
     gravity: Floats
-    geodetic: bool
+    geodetic: bool = False
 
 
-def prior_rows(path: Path) -> Sequence[PriorRow]:
-    """The pose priors of a database, empty where it has none. Raises `SourceError` where it is none."""
+def noted_priors(path: Path) -> dict[str, Known]:
+    """The pose priors of a database by the image's name, as it has them. Raises `SourceError` where it is none."""
     with _opened(path) as database:
         if not _has_table(database, "pose_priors"):
-            return ()
+            return {}
         names = dict(database.execute("SELECT image_id, name FROM images"))
         table = database.execute("SELECT * FROM pose_priors")
         columns = [column for column, *_ in table.description]
         rows = [dict(zip(columns, row, strict=True)) for row in table]
-        return [_prior(names[_image_of(row)], row) for row in rows if _image_of(row) in names]
+        return {names[_image_of(row)]: _prior(row) for row in rows if _image_of(row) in names}
 
 
 def _image_of(row: Mapping[str, Any]) -> int | None:
@@ -120,14 +119,14 @@ def _image_of(row: Mapping[str, Any]) -> int | None:
     return int(row.get("corr_data_id", row.get("image_id")))
 
 
-def _prior(name: str, row: Mapping[str, Any]) -> PriorRow:
+def _prior(row: Mapping[str, Any]) -> Known:
     cells = []
     for column, count in (("position", 3), ("position_covariance", 9), ("gravity", 3)):
         data = row.get(column)
         whole = isinstance(data, bytes) and len(data) == 8 * count
         cells.append(np.frombuffer(data, "<f8").copy() if whole and data is not None else np.full(count, np.nan))
     position, covariance, gravity = cells
-    return PriorRow(name, position, covariance.reshape(3, 3), gravity, row.get("coordinate_system") == GEODETIC)
+    return Known(position, covariance.reshape(3, 3), gravity, row.get("coordinate_system") == GEODETIC)
 
 
 def database_matches(path: Path, row_of_name: Mapping[str, int]) -> Iterator[tuple[int, int, Ints]]:

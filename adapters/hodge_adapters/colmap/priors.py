@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hodge_adapters.colmap.bodies import Bodies
-from hodge_adapters.colmap.database import prior_rows
+from hodge_adapters.colmap.database import Known, noted_priors
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.trajectories.positions import read_positions
 from hodge_pipeline import se3
@@ -32,31 +32,20 @@ SPREAD_SIGMAS = 3.0
 NONE, GRAVITY_UP = np.full(3, np.nan), np.array([0.0, 0.0, 1.0])
 
 
-@dataclass(frozen=True)
-class Known:
-    """Of one image: `position (3,)` in metres and its `covariance (3, 3)`; `gravity (3,)` in its axes; NaN: unknown."""
-
-    position: Floats
-    covariance: Floats
-    gravity: Floats
-
-
 def database_priors(path: Path) -> dict[str, Known]:
     """What the database knows of each image by name. Geodetic positions are east, north, up from the first image's.
 
     Raises `SourceError` where some are geodetic and others not.
     """
-    rows = prior_rows(path)
-    geodetic = {row.geodetic for row in rows if np.isfinite(row.position).all()}
+    noted = noted_priors(path)
+    geodetic = {one.geodetic for one in noted.values() if np.isfinite(one.position).all()}
     if len(geodetic) > 1:
         raise SourceError(f"{path}: some pose priors are geodetic, others Cartesian: give those of one kind")
-    positions = np.array([row.position for row in rows]).reshape(-1, 3)
+    positions = np.array([one.position for one in noted.values()]).reshape(-1, 3)
     known = np.isfinite(positions).all(axis=1)
     if geodetic == {True}:
         positions[known] = pycolmap.GPSTransform().ellipsoid_to_enu(positions[known], *positions[known][0])
-    return {
-        row.name: Known(position, row.covariance, row.gravity) for row, position in zip(rows, positions, strict=True)
-    }
+    return {name: one._replace(position=at) for (name, one), at in zip(noted.items(), positions, strict=True)}
 
 
 def table_priors(path: Path, notes: list[str]) -> dict[str, Known]:

@@ -18,7 +18,7 @@ from hodge_adapters.colmap.bodies import Bodies, bodies_of, body_graph
 from hodge_adapters.colmap.bundle import Refine, adjust
 from hodge_adapters.colmap.calibration_changes import calibration_changes
 from hodge_adapters.colmap.content import content_of, read_reconstruction, refreshed
-from hodge_adapters.colmap.database import database_pairs
+from hodge_adapters.colmap.database import Known, database_pairs
 from hodge_adapters.colmap.edges import covisible_pairs, measured_graph
 from hodge_adapters.colmap.points import (
     parallaxes,
@@ -28,7 +28,7 @@ from hodge_adapters.colmap.points import (
     update_errors,
     with_points,
 )
-from hodge_adapters.colmap.priors import Known, body_priors, placing
+from hodge_adapters.colmap.priors import body_priors, placing
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import Model
 from hodge_adapters.colmap.resection import resected
