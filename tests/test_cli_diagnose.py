@@ -221,7 +221,7 @@ def test_a_wrong_edge_without_a_listed_cycle_says_what_is_against_it() -> None:
     found = diagnose(graph)
     assert found.verdict.tolist().count("wrong") > 5
     bare = replace(found, witnesses_against=np.full_like(found.witnesses_against, -1))
-    table = edge_table(PageContents("", "", graph, bare, ("",) * graph.edge_count, (), ()))
+    table = edge_table(PageContents("", graph, bare, ("",) * graph.edge_count, (), ()))
     rows = table.rows
     assert "cycles for" not in table.header, "a column of nothing pushes numbers off the page"
     against = {row[1]: row[3] for row in rows}

@@ -39,7 +39,7 @@ def prepare_clouds(
     made = workers.map(partial(_make_block, options=options), in_blocks(frames))
     clouds = CloudSet.write(folder, map(counted_in, in_order(made)))
     odd = [counts.odd for counts in every if counts.odd is not None]
-    if not any(counts.points for counts in every):
+    if not any(counts.valid for counts in every):
         reason = odd[0] if odd else "the source has no frames"
         raise no_clouds(frames, reason)
     odd += [Oddity(frame.frame_id, BLANK) for frame, counts in zip(frames, every, strict=True) if counts.blank]

@@ -95,13 +95,12 @@ class Oddity(NamedTuple):
 
 
 class CloudCounts(NamedTuple):
-    """What became of a frame: measurements looked at, those valid and in range, points kept; what is odd, whether its
-    colour image is `blank`, how many points of a scan are no returns, and its reach in metres, NaN for a depth image.
+    """What became of a frame: measurements looked at, those valid and in range; what is odd, whether its image is
+    `blank`, how many points of a scan are no returns, and its reach in metres, NaN for a depth image.
     """
 
     looked_at: int
     valid: int
-    points: int
     odd: Oddity | None = None
     blank: bool = False
     no_returns: int = 0
@@ -111,12 +110,8 @@ class CloudCounts(NamedTuple):
 class _Samples(NamedTuple):
     points_in_cam: Floats32
     colours: Bytes | None
-    looked_at: int
-    odd: Oddity | None = None
-    why_none: str = ""
-    blank: bool = False
-    no_returns: int = 0
-    reach_m: float = float("nan")
+    counts: CloudCounts
+    why_none: str
 
 
 def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCounts]:
@@ -127,16 +122,13 @@ def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCo
     """
     samples = _read_samples(frame, options)
     points, colours = voxel_means(samples.points_in_cam, samples.colours, options.voxel_m)
-    landmarks = _landmarks(frame, options)
-    cloud = PointCloud(points, _normals(points), colours, landmarks)
-    odd = samples.odd
+    cloud, counts = PointCloud(points, _normals(points), colours, _landmarks(frame, options)), samples.counts
     if not len(points):
         odd = Oddity(frame.frame_id, "no valid measurement in range, its cloud is empty", samples.why_none)
-    elif samples.looked_at > MANY_POINTS:
-        kept = f"{counted(samples.looked_at, 'point')} to {len(points)}, one a voxel of {options.voxel_m:.3g} m"
-        odd = Oddity(frame.frame_id, "down-sampled in parts", kept)
-    valid, no_returns = len(samples.points_in_cam), samples.no_returns
-    counts = CloudCounts(samples.looked_at, valid, len(points), odd, samples.blank, no_returns, samples.reach_m)
+        return cloud, counts._replace(odd=odd)
+    if counts.looked_at > MANY_POINTS:
+        kept = f"{counted(counts.looked_at, 'point')} to {len(points)}, one a voxel of {options.voxel_m:.3g} m"
+        return cloud, counts._replace(odd=Oddity(frame.frame_id, "down-sampled in parts", kept))
     return cloud, counts
 
 
@@ -185,7 +177,7 @@ def make_or_report(frame: Frame, options: CloudOptions) -> tuple[PointCloud, Clo
         return make_cloud(frame, options)
     except (SourceError, OSError) as error:
         odd = Oddity(frame.frame_id, "its cloud is empty", str(error))
-        return PointCloud(np.zeros((0, 3), np.float32)), CloudCounts(0, 0, 0, odd)
+        return PointCloud(np.zeros((0, 3), np.float32)), CloudCounts(0, 0, odd)
 
 
 def _read_samples(frame: Frame, options: CloudOptions) -> _Samples:
@@ -215,7 +207,7 @@ def _back_project(frame: Frame, read_depth: Callable[[], Floats32], camera: Came
         except (SourceError, OSError) as error:
             odd = Oddity(frame.frame_id, "its cloud has no colours", str(error))
     why_none = "" if len(rows) else _range_advice(z, "depth_scale", options)
-    return _Samples(np.stack([x, y, z_kept], axis=1), colours, z.size, odd, why_none, blank)
+    return _Samples(np.stack([x, y, z_kept], axis=1), colours, CloudCounts(z.size, len(rows), odd, blank), why_none)
 
 
 def _sensor_points(cloud: PointCloud, options: CloudOptions) -> _Samples:
@@ -224,9 +216,8 @@ def _sensor_points(cloud: PointCloud, options: CloudOptions) -> _Samples:
     why_none = "" if len(kept) else out_of_range(cloud, options)
     zeros = 0 if len(kept) == len(cloud) else int((~(_ranges(cloud) > 0)).sum())  # true for NaN
     lost, points = zeros + cloud.no_numbers, np.asarray(kept.points_in_cam, np.float32)
-    return _Samples(
-        points, colours, len(cloud) + cloud.no_numbers, why_none=why_none, no_returns=lost, reach_m=reach_m(cloud)
-    )
+    looked_at, reach = len(cloud) + cloud.no_numbers, reach_m(cloud)
+    return _Samples(points, colours, CloudCounts(looked_at, len(points), no_returns=lost, reach_m=reach), why_none)
 
 
 def reach_m(cloud: PointCloud) -> float:

@@ -33,7 +33,6 @@ class Matches:
     pairs: Ints
     i_from_j: Floats
     inliers: Ints
-    matches: Ints
     rivals: Ints
 
     @classmethod
@@ -45,7 +44,6 @@ class Matches:
             np.repeat(np.asarray(pairs, np.int64).reshape(-1, 2), counts, axis=0),
             np.array([one.i_from_j for one in found], float).reshape(-1, 4, 4),
             np.array([one.inliers for one in found], np.int64),
-            np.array([one.matches for one in found], np.int64),
             np.array([one.rivals for one in found], np.int64),
         )
 

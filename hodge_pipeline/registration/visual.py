@@ -35,7 +35,6 @@ class VisualMotion:
     i_from_j: Floats
     information: Floats
     inliers: int
-    matches: int
 
 
 def covariances(points: Floats, pixel_sigma_rad: Floats, depth_sigmas: float) -> Floats:
@@ -83,7 +82,7 @@ def visual_motion(
             break
     if inlier.sum() < FEWEST_MATCHES:
         return None
-    return VisualMotion(motion, information, int(inlier.sum()), count)
+    return VisualMotion(motion, information, int(inlier.sum()))
 
 
 def fit_triples(points_b: Floats, points_a: Floats) -> Floats:

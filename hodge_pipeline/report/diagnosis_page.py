@@ -38,7 +38,6 @@ class PageContents:
     """The contents of the page. `advice` has a line for each edge; `commands` are what to type next."""
 
     title: str
-    path: str
     graph: ViewGraph
     diagnosis: Diagnosis
     advice: tuple[str, ...]

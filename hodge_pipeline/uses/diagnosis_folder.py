@@ -52,7 +52,6 @@ def _page(diagnosed: Diagnosed) -> PageContents:
     pictures = edge_pictures(subject.graph, found, rows, subject.frames, subject.clouds, has_metres=subject.has_metres)
     return PageContents(
         title=subject.name,
-        path=str(subject.path),
         graph=subject.graph,
         diagnosis=found,
         advice=diagnosed.advice,
