@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.registration.assessment import SAME_FITNESS
+from hodge_pipeline.registration.global_evidence import MOST_VIOLATION
 from hodge_pipeline.registration.odometry_path import contradicts_odometry, without_slides
 from hodge_pipeline.registration.sliding import consecutive, weak_directions
 from hodge_pipeline.scene import Drift
-from hodge_pipeline.types import Edges, Ints
+from hodge_pipeline.types import Edges, Floats, Ints
 from hodge_pipeline.types.edges import HELD_OUT, REGISTERED, REJECTED, USED
 
-CONTRADICTS = "contradicts odometry"
+CONTRADICTS, SEEN_THROUGH = "contradicts odometry", "one camera saw through the other's surface"
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -42,15 +45,25 @@ class Acceptance:
         "wrong. 0.02: normals within 8° of each other. Consecutive frames, and all below twice that, "
         "stay at their guess in such a direction",
     )
+    max_seen_through: float | None = Field(
+        default=MOST_VIOLATION,
+        gt=0,
+        lt=1,
+        description="share of the points in view that the other depth image of a pair saw through, at most: more has a "
+        "pair that slid along a counter, a table or a wall, however well these fit. Of depth images alone; null: any, "
+        "as for landmarks, which do not slide, while what a rolling shutter bends may seem seen through",
+    )
 
-    def reasons(self, registered: Edges, in_order: bool = True) -> NDArray[np.str_]:
+    def reasons(self, registered: Edges, in_order: bool = True, through: Floats | None = None) -> NDArray[np.str_]:
         """Why each pair (P,) is rejected by itself, an empty word where it is accepted.
 
-        Steps of frames that are `in_order` may slide: they stay at their guess.
+        Steps of frames that are `in_order` may slide: they stay at their guess. `through (P,)`: see `seen_through`.
         """
         out = np.full(len(registered.pairs), "", "U64")
         weak, _ = weak_directions(registered, self.min_spread)
         out[weak.any(axis=1) & ~(in_order & consecutive(registered))] = "what they share lets them slide"
+        if through is not None and self.max_seen_through is not None:
+            out[through > self.max_seen_through] = SEEN_THROUGH  # false for NaN
         if self.max_rmse_m is not None:
             out[~(registered.rmse_m <= self.max_rmse_m)] = "points too far apart"
         out[~(registered.fitness >= self.min_fitness)] = "too little overlap"
@@ -58,16 +71,23 @@ class Acceptance:
         return out
 
 
-def accepted(edges: Edges, acceptance: Acceptance, drift: Drift | None, in_order: bool = True) -> tuple[Edges, Ints]:
+def accepted(
+    edges: Edges,
+    acceptance: Acceptance,
+    drift: Drift | None,
+    in_order: bool = True,
+    through: Callable[[Edges], Floats] | None = None,
+) -> tuple[Edges, Ints]:
     """The table with `status` (used or rejected) and `why` of every registered pair, and the rows (S,) to which an
     odometry step slid unnoticed, as the pairs across that step agree. Held-out pairs stay as they are.
 
     `drift`: odometry's poses and their covariance, None without odometry. `in_order`: whether consecutive rows are
-    steps of a path.
+    steps of a path. `through` tells what of registered pairs the other camera saw through.
     """
     rows = np.flatnonzero(edges.status != HELD_OUT)
     registered = edges.select(rows)
-    reasons = acceptance.reasons(registered, in_order)
+    seen = None if through is None or acceptance.max_seen_through is None else through(registered)
+    reasons = acceptance.reasons(registered, in_order, seen)
     slid = np.zeros(0, np.int64)
     if drift is not None:
         good = np.flatnonzero(reasons == "")
@@ -77,16 +97,18 @@ def accepted(edges: Edges, acceptance: Acceptance, drift: Drift | None, in_order
 
 
 def with_odometry(edges: Edges, odometry: Edges) -> Edges:
-    """The table with every odometry step whose registration was rejected as contradicting odometry accepted again:
-    with odometry's own measurement, or with the registration where that fits better by more than `SAME_FITNESS`.
+    """The table with every odometry step whose registration was rejected as contradicting odometry, or by free space,
+    accepted again: with odometry's own measurement, or with the registration where that contradicts odometry alone and
+    fits better by more than `SAME_FITNESS`.
 
     Where clouds slide, the round's registration of a step may end elsewhere than odometry's.
     """
     steps = np.flatnonzero((odometry.proposed_by == "sequential") & (odometry.status == USED))
     measured = {(int(i), int(j)): int(row) for row, (i, j) in zip(steps, odometry.pairs[steps], strict=True)}
-    again = [row for row in np.flatnonzero(edges.why == CONTRADICTS) if tuple(edges.pairs[row].tolist()) in measured]
+    doubted = np.flatnonzero(np.isin(edges.why, (CONTRADICTS, SEEN_THROUGH)))
+    again = [row for row in doubted if tuple(edges.pairs[row].tolist()) in measured]
     rows = np.array([measured[int(i), int(j)] for i, j in edges.pairs[again]], np.int64)
     lost = np.array(again, np.int64)
-    worse = odometry.fitness[rows] < edges.fitness[lost] - SAME_FITNESS
+    worse = (edges.why[lost] == CONTRADICTS) & (odometry.fitness[rows] < edges.fitness[lost] - SAME_FITNESS)
     columns = {name: getattr(odometry, name)[rows[~worse]] for name in REGISTERED}
     return edges.put(lost, status=USED, why="").put(lost[~worse], **columns)

@@ -17,6 +17,13 @@ FEWEST_SEEN = 30
 """Points, at least, of which a share is told: its standard error is 9 % at most."""
 VIEW_WIDTH = 160
 """Pixels across a small depth image, one in 4 of 640."""
+CLOUD_VIEW_WIDTH = 80
+"""Pixels across the view of a cloud: with their neighbours they are as wide as its voxels, 3 cm, at 1.5 m."""
+MOST_VIOLATION = 0.15
+"""The share of the points in view that the other depth image may have seen through. Places that look alike differ in
+what surrounds them. Of 1170 right pairs of surfaces of red kitchen, fr1/rpy and ICL-NUIM none has more, and of 15 that
+slid by 25 cm or more all but one.
+"""
 MARGIN_M, MARGIN_PER_M2 = 0.06, 0.006
 """Depth noise of structured light grows with the square of the distance; a match is off by centimetres."""
 NEAREST_M = 0.1
@@ -65,6 +72,19 @@ def depth_view(depth: Floats32, camera: Camera) -> DepthView:
     small = depth[::stride, ::stride]
     open_ended = np.where(small > 0, small, np.float32(np.inf)).astype(np.float32)
     return DepthView(minimum_filter(open_ended, 3, mode="nearest"), stride, camera)
+
+
+def cloud_view(points: Floats, camera: Camera, scale: float = 1.0) -> DepthView:
+    """The view of a depth image from its down-sampled cloud (N, 3): the nearest of its points in and around each pixel.
+
+    It costs half a millisecond, a tenth of reading the image again.
+    """
+    stride = max(1, camera.width // CLOUD_VIEW_WIDTH)
+    height, width = -(-camera.height // stride), -(-camera.width // stride)
+    view = DepthView(np.full((height, width), np.inf, np.float32), stride, camera)
+    row, column, z = view.project(points, NEAREST_M * scale)
+    np.minimum.at(view.nearest_m, (row, column), z.astype(np.float32))
+    return DepthView(minimum_filter(view.nearest_m, 3, mode="nearest"), stride, camera)
 
 
 def panorama(points: Floats) -> DepthView:

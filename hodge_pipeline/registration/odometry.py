@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass as plain_dataclass
 from functools import partial
 from pathlib import Path
@@ -14,10 +14,11 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline import se3
 from hodge_pipeline.registration.gaps import over_gap
 from hodge_pipeline.registration.gicp import Gicp
+from hodge_pipeline.registration.global_evidence import MOST_VIOLATION
 from hodge_pipeline.registration.pairs import prepared_clouds
 from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
-from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Registration
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Registration
 
 STEPS_IN_BLOCK, WARM_UP_STEPS = 32, 2
 """Steps that a worker registers at once, and those before them that give it its first velocity."""
@@ -50,6 +51,19 @@ class OdometryOptions:
         "degrees of freedom: 9.5 sigma for 0.01). Of 2300 right pairs on four real sequences it rejects none. null: "
         "odometry rejects no pair",
     )
+    max_seen_through: float | None = Field(
+        default=MOST_VIOLATION,
+        gt=0,
+        lt=1,
+        description="share of the points in view that the other depth image of a step saw through, at most: beyond it "
+        "the step slid, and tracking is lost; null: any",
+    )
+
+    def slid(self, registered: Edges, through: Callable[[Edges], Floats] | None) -> Bools:
+        """Where (P,) free space refutes a registration; nowhere without `max_seen_through`, or `through`."""
+        if through is None or self.max_seen_through is None:
+            return np.zeros(len(registered), bool)
+        return np.asarray(through(registered) > self.max_seen_through)  # false for NaN
 
 
 @plain_dataclass(frozen=True)
@@ -77,12 +91,13 @@ def odometry(
     options: OdometryOptions,
     workers: Workers,
     advance: Advance = no_progress,
+    through: Callable[[Edges], Floats] | None = None,
 ) -> Odometry:
     """Poses of every frame; each sequence begins with the identity rotation, beside the sequence before it.
 
     Frames without points are bridged, and keep the pose of the frame before them. A block of steps starts two steps
     early to know its velocity, so that blocks run side by side and the result does not depend on the workers.
-    `advance` counts frames.
+    `advance` counts frames; `through` tells what of registered steps the other camera saw through.
     """
     clouds = CloudSet.open(folder)
     sizes = clouds.sizes
@@ -94,13 +109,19 @@ def odometry(
     steps = Edges.joined([results[number] for number in range(len(blocks))])
     gap = over_gap(steps.pairs, sequences, stamps_s)
     lost = ~(steps.fitness >= np.where(gap, max(SURE_FITNESS, options.min_fitness), options.min_fitness))
+    slid = ~lost & options.slid(steps, through)
     poses = chained(len(sizes), sequences, steps, REACHES_APART * clouds.reach_m)
     notes = tuple(
         f"tracking was lost between rows {i} and {j} ({'a hole in the recording, ' if hole else ''}fitness "
         f"{fitness:.2f}): no edge there, the motion is guessed"
         for (i, j), fitness, hole in zip(steps.pairs[lost], steps.fitness[lost], gap[lost], strict=True)
     )
-    return Odometry(poses, steps.select(~lost), notes)
+    notes += tuple(
+        f"tracking was lost between rows {i} and {j} (surfaces fit, but one camera saw through what the other saw): no "
+        "edge there, the motion is guessed"
+        for i, j in steps.pairs[slid]
+    )
+    return Odometry(poses, steps.select(~lost & ~slid), notes)
 
 
 def _blocks(rows: Ints, stamps_s: Floats) -> list[_Block]:

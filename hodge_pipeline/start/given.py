@@ -16,6 +16,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.trajectory import associate
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import OdometryOptions
+from hodge_pipeline.registration.seen_through import depth_cameras
 from hodge_pipeline.scene import (
     START,
     GivenFile,
@@ -157,7 +158,10 @@ class GivenStart:
         ends = np.cumsum([0, *map(len, gaps)])
         places = tuple(np.arange(start, end) for start, end in pairwise(ends))
         title = "poses between the given ones"
-        found = steps.step(chain, made, places, stamps, self.odometry, title=title, total=len(rows), workers=workers)
+        found = steps.step(
+            chain, made, places, stamps, depth_cameras(part.frames), clouds.unit_m, self.odometry,
+            title=title, total=len(rows), workers=workers,
+        )  # fmt: skip
         poses = given.copy()
         for gap, place in zip(gaps, places, strict=True):
             poses[gap[~known[gap]]] = _carried(found.world_from_cam[place], gap, given, known)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,11 +24,13 @@ def bridge(
     poses: Floats,
     options: OdometryOptions,
     workers: Workers,
+    through: Callable[[Edges], Floats],
 ) -> tuple[Edges, Floats]:
     """The good steps and the bridges found, and the poses (K, 4, 4) of the K key frames with the bridges applied.
 
     A step with a fitness below `options.min_fitness` is a break; its bridge is the fittest registration between one of
-    the three key frames before it and one of the three after it.
+    the three key frames before it and one of the three after it that free space does not refute: `through` tells what
+    of registered pairs the other camera saw through.
     """
     good = steps.fitness >= options.min_fitness
     breaks = steps.pairs[~good]
@@ -38,11 +40,10 @@ def bridge(
     pairs = np.unique(pairs, axis=0)
     guesses = se3.between(poses, pairs)
     found = register_pairs(clouds, options.registration, Edges.of(pairs, "sequential"), guesses, workers)
+    holds = (found.fitness >= options.min_fitness) & ~options.slid(found, through)
     bridges, moved = [], poses.copy()
     for i, j in breaks.tolist():
-        over = np.flatnonzero(
-            (found.pairs[:, 0] <= i) & (found.pairs[:, 1] >= j) & (found.fitness >= options.min_fitness)
-        )
+        over = np.flatnonzero((found.pairs[:, 0] <= i) & (found.pairs[:, 1] >= j) & holds)
         if len(over):
             best = over[np.argmax(found.fitness[over])]
             a, b = found.pairs[best]

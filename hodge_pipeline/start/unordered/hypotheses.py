@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline import se3
+from hodge_pipeline.registration.acceptance import SEEN_THROUGH
 from hodge_pipeline.registration.colour_evidence import hue_conflicts
-from hodge_pipeline.registration.global_evidence import DepthView, violation
+from hodge_pipeline.registration.global_evidence import MOST_VIOLATION, DepthView, violation
 from hodge_pipeline.registration.global_pairs import Matches
 from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.registration.sliding import weak_directions
@@ -40,10 +41,8 @@ furnished ones it has 4 to 20 times the violation.
 AMBIGUOUS, NO_LEAD = "it fits in several ways", "another motion explains as many matches"
 USUAL_TIMES = 12.0
 """Limit on violation and hue conflict, times the lower quartile of the run: at least a quarter is taken as right."""
-LEAST_VIOLATION, MOST_VIOLATION = 0.03, 0.15
-"""Bounds on the share of the points in view that the other depth image may have seen through. Places that look alike
-differ in what surrounds them.
-"""
+LEAST_VIOLATION = 0.03
+"""The share of the points in view that the other depth image may always have seen through."""
 LEAST_HUE_CONFLICT = 0.02
 """Of the common points, whose hue may always differ."""
 ViewOf = Callable[[int], DepthView | None]
@@ -110,7 +109,7 @@ class _Evidence:
         out = np.full(len(self.hue), "", "U64")
         out[self.hue > allowed_hue_conflict(self.hue[best])] = "their colours differ"
         violated = self.seen_through > allowed_violation(self.seen_through[best])
-        out[violated] = "one camera saw through the other's surface"
+        out[violated] = SEEN_THROUGH
         out[self.slides] = "what they share lets them slide"
         out[~(self.rmse_m <= limits.max_rmse_m)] = "points too far apart"
         out[~(self.overlap >= limits.min_overlap)] = "too little overlap"

@@ -1,0 +1,80 @@
+"""Pairs that slid along a bare surface are refuted by free space, and are neither edges nor steps of odometry."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hodge_pipeline import se3
+from hodge_pipeline.executors.local import LocalExecutor
+from hodge_pipeline.registration.acceptance import SEEN_THROUGH, Acceptance, accepted, with_odometry
+from hodge_pipeline.registration.global_evidence import MOST_VIOLATION
+from hodge_pipeline.registration.odometry import OdometryOptions, odometry
+from hodge_pipeline.registration.seen_through import seen_through
+from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, PointCloud, Registration
+
+CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+PAIRS = [[0, 1], [0, 2], [1, 2]]
+SLID = np.array([0.0, 0.6, 0.0])
+"""Metres along the wall by which each pair is off."""
+
+
+@pytest.fixture(scope="module")
+def clouds() -> CloudSet:
+    """A bare wall at 2 m with a post a metre before it, seen three times from one place."""
+    u, v = np.meshgrid(np.arange(-1.2, 1.2, 0.03), np.arange(-0.9, 0.9, 0.03))
+    wall = np.stack([u, v, np.full_like(u, 2.0)], axis=-1).reshape(-1, 3)
+    post = wall[np.abs(wall[:, 0]) < 0.3] * [1.0, 0.5, 0.5]
+    behind = np.abs(wall[:, 0]) < 0.6
+    return CloudSet.from_clouds([PointCloud(np.concatenate([wall[~behind], post]).astype(np.float32))] * 3)
+
+
+@pytest.fixture(scope="module")
+def registered() -> Edges:
+    motions = se3.exp(np.concatenate([np.zeros((3, 3)), SLID[:, None] * [1, 0, 0]], axis=1))
+    return Edges.of(PAIRS).with_registrations([Registration(m, np.eye(6), 0.7, 0.01, 900, 5, True) for m in motions])
+
+
+def test_what_slid_before_what_the_other_saw_through_is_no_edge(clouds: CloudSet, registered: Edges) -> None:
+    through = seen_through(registered, clouds, [CAMERA] * 3)
+    assert through[0] == through[2] == 0 and through[1] > MOST_VIOLATION
+    assert np.isnan(seen_through(registered, clouds, [CAMERA, None, CAMERA])).tolist() == [True, False, True]
+    assert Acceptance(min_spread=0).reasons(registered, through=through).tolist() == ["", SEEN_THROUGH, ""]
+    assert set(Acceptance(min_spread=0, max_seen_through=None).reasons(registered, through=through)) == {""}
+
+
+def test_the_unit_of_length_does_not_matter(clouds: CloudSet, registered: Edges) -> None:
+    large = CloudSet.from_clouds([PointCloud(100 * cloud.points_in_cam) for cloud in clouds])
+    motions = registered.i_from_j.copy()
+    motions[:, :3, 3] *= 100
+    found = seen_through(registered.put(slice(None), i_from_j=motions), large, [CAMERA] * 3, scale=100.0)
+    np.testing.assert_allclose(found, seen_through(registered, clouds, [CAMERA] * 3), atol=1e-6)
+
+
+def test_a_step_that_a_round_slides_keeps_the_measurement_of_odometry(clouds: CloudSet, registered: Edges) -> None:
+    def through(edges: Edges) -> Floats:
+        return seen_through(edges, clouds, [CAMERA] * 3)
+
+    judged, _ = accepted(registered, Acceptance(min_spread=0), None, through=through)
+    assert judged.why.tolist() == ["", SEEN_THROUGH, ""]
+    step = registered.select(np.array([1])).put(slice(None), proposed_by="sequential", i_from_j=np.eye(4), fitness=0.4)
+    kept = with_odometry(judged, step)
+    assert kept.counts.all() and np.array_equal(kept.i_from_j[1], np.eye(4))
+    any_ = accepted(registered, Acceptance(min_spread=0, max_seen_through=None), None, through=through)[0]
+    assert any_.counts.all()
+
+
+@pytest.mark.parametrize("limit", [MOST_VIOLATION, None])
+def test_odometry_is_lost_at_a_step_that_free_space_refutes(
+    clouds: CloudSet, limit: float | None, tmp_path: Path
+) -> None:
+    clouds.save(tmp_path)
+    options = OdometryOptions(max_seen_through=limit)
+    shares = np.array([0.0, 0.4])
+    with LocalExecutor(workers=0).open() as workers:
+        found = odometry(tmp_path, [np.arange(3)], np.arange(3.0), options, workers, through=lambda steps: shares)
+    assert found.steps.pairs.tolist() == ([[0, 1]] if limit else [[0, 1], [1, 2]])
+    assert len(found.notes) == (limit is not None)
+    assert all("rows 1 and 2 (surfaces fit" in note for note in found.notes)
