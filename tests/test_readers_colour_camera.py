@@ -73,6 +73,44 @@ def test_edges_tell_where_colour_was_seen_from(tmp_path: Path) -> None:
     np.testing.assert_array_equal(same.frames[0].read_colour()[240, :, 0] < 120, same.frames[0].read_depth()[240] < 1.5)
 
 
+def swaying(folder: Path, late: int, seen_at: Callable[[int], int]) -> SevenScenesReader:
+    """A board that sways before a wall; colour is of `late` frames before, seen as of `two_walls`."""
+    folder.mkdir(parents=True)
+    for number in range(20):
+        left, shown = (200 + round(70 * np.sin(0.5 * at) + 40 * np.sin(0.21 * at)) for at in (number, number - late))
+        depth = np.full((480, 640), 2000, np.uint16)
+        depth[:, left : left + 200] = 1000
+        colour = np.full((480, 640, 3), 200, np.uint8)
+        colour[:, seen_at(shown) : seen_at(shown + 200)] = 40
+        cv2.imwrite(str(folder / f"frame-{number:06d}.depth.png"), depth)
+        cv2.imwrite(str(folder / f"frame-{number:06d}.color.png"), colour)
+    return SevenScenesReader()
+
+
+@pytest.mark.parametrize(("late", "told"), [(0, ""), (1, "1 frame later"), (-3, "3 frames earlier"), (6, "")])
+def test_colour_of_another_moment_is_paired_anew_before_it_is_drawn_on_depth(
+    late: int, told: str, tmp_path: Path
+) -> None:
+    folder = tmp_path / "seq-01"
+    source = swaying(folder, late, lambda u: round(525 / 585 * (u - 320) + 320 - 13.125)).open(folder)
+    assert [(note.kind, note.count, note.detail) for note in source.doubts] == (
+        [("colour paired anew", late, told)] if told else []
+    ), "at 6, an end of those tried, it may be later still"
+    if told:
+        assert any("colour is not registered to depth" in note for note in source.notes)
+        depth, colour = source.frames[8].read_depth(), source.frames[8].read_colour()
+        dark = np.flatnonzero(np.diff(colour[240, :, 0] < 120))
+        assert np.abs(dark - np.flatnonzero(np.diff(depth[240] < 1.5))).max() <= 8
+        without = [row for row, frame in enumerate(source.frames) if frame.read_colour is None]
+        assert without == [row for row in range(20) if not 0 <= row + late < 20]
+    assert len(source.files) == 40
+
+
+def test_registered_colour_is_left_to_who_runs_the_sequence(tmp_path: Path) -> None:
+    folder = tmp_path / "seq-01"
+    assert swaying(folder, 2, lambda u: u).open(folder).doubts == ()
+
+
 def test_depth_is_read_again_where_its_file_has_changed(tmp_path: Path) -> None:
     folder = two_walls(tmp_path / "seq-01", lambda u: u)
     frame = SevenScenesReader(colour_camera="kinect").open(folder).frames[0]

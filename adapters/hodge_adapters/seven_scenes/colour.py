@@ -13,7 +13,7 @@ import numpy as np
 from hodge_adapters.images import pixels
 from hodge_adapters.images.second_camera import SecondCamera, on_depth_pixels
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Bytes, Camera, Floats, Floats32
+from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Ints
 from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.image_edges import FEWEST_EDGES, change_along_rows, depth_edges
 
@@ -27,6 +27,14 @@ LEAST_CHANGE = 1.0
 SURE = 2.5
 """Standard errors of the mean over the frames that show unregistered colour. Red kitchen and stairs have 7 to 10;
 fr1/xyz, fr1/rpy, fr3/cabinet and ICL-NUIM, whose colour is registered, 0 to −13.
+"""
+MOST_LATE, FEWEST_LATE = 6, 5
+"""Frames before and after whose colour is tried; frames that are needed for that."""
+NEAR_LATE, EVERY_LATE = (-1, 0, 1), tuple(range(-MOST_LATE, MOST_LATE + 1))
+"""Moments tried at first, and where that of depth is not surely the best of them."""
+LEAST_GAIN = float(np.log(1.25))
+"""Agreement at the best moment over that at any other, as of all colour of another moment. Red kitchen has 1.35 to 1.9,
+at 6 to 8 standard errors.
 """
 
 
@@ -58,30 +66,72 @@ def is_unregistered(colour: Sequence[Path], depth: Sequence[DepthFile]) -> bool:
     """
     if len(depth) < FEWEST_FRAMES or depth[0].size != SIZE:
         return False
-    gains = []
-    for row in evenly(len(depth), FRAMES):
-        own = depth[row]
+    found = _sampled(colour, depth, evenly(len(depth), FRAMES).tolist(), (0,))
+    gains = found[:, 0, 0] - found[:, 0, 1]
+    return len(gains) >= FEWEST_FRAMES and bool(gains.mean() > SURE * gains.std() / np.sqrt(len(gains)))
+
+
+def frames_late(colour: Sequence[Path | None], depth: Sequence[DepthFile]) -> int:
+    """How many frames later the colour of an unregistered camera is to be taken, negative: earlier; 0 where no other
+    moment is surely better than every other, or the best one is an end of those tried.
+    """
+    inner = np.arange(MOST_LATE, len(depth) - MOST_LATE)
+    if len(inner) < FEWEST_LATE or depth[0].size != SIZE:
+        return 0
+    rows = inner[evenly(len(inner), FRAMES)].tolist()
+    if _is_best(_sampled(colour, depth, rows, NEAR_LATE)) == (NEAR_LATE.index(0), 0):
+        return 0
+    best = _is_best(_sampled(colour, depth, rows, EVERY_LATE))
+    return EVERY_LATE[best[0]] if best is not None and best[1] == 0 and 0 < best[0] < len(EVERY_LATE) - 1 else 0
+
+
+def _is_best(found: Floats) -> tuple[int, int] | None:
+    """The moment and camera whose agreements (F, M, 2) surely exceed those at every other; None without one."""
+    if len(found) < FEWEST_LATE:
+        return None
+    moment, camera = np.unravel_index(int(found.mean(axis=0).argmax()), found.shape[1:])
+    others = found.reshape(len(found), -1).copy()
+    own = found[:, moment, camera]
+    others[:, np.ravel_multi_index((moment, camera), found.shape[1:])] = -np.inf
+    gains = own - others.max(axis=1)
+    is_sure = gains.mean() > max(SURE * gains.std() / np.sqrt(len(gains)), LEAST_GAIN)
+    return (int(moment), int(camera)) if is_sure else None
+
+
+def _sampled(
+    colour: Sequence[Path | None], depth: Sequence[DepthFile], rows: Sequence[int], late: Sequence[int]
+) -> Floats:
+    """The agreement (F, M, 2) of depth of these rows with colour of so many frames later, see `_agreement`; without
+    rows that lack an image, or one that can be read, or have too few edges.
+    """
+    out = []
+    for row in rows:
+        own, paths = depth[row], [path for step in late if (path := colour[row + step]) is not None]
         try:
-            gains.append(_gain(own.read(), pixels.read_colour(colour[row], size=own.size), own.camera))
+            edges = depth_edges(own.read()) if len(paths) == len(late) else None
+            images = (pixels.read_colour(path, size=own.size) for path in paths)
+            each = [] if edges is None else [_agreement(edges, image, own.camera) for image in images]
         except (SourceError, OSError):
             continue
-    known = np.array(gains)[np.isfinite(gains)]
-    return len(known) >= FEWEST_FRAMES and bool(known.mean() > SURE * known.std() / np.sqrt(len(known)))
+        if each and np.isfinite(each).all():
+            out.append(each)
+    return np.array(out, float).reshape(-1, len(late), 2)
 
 
-def _gain(depth_m: Floats32, colour: Bytes, camera: Camera) -> float:
-    """Logarithm of the mean gradient of colour at depth edges as a Kinect's colour camera sees them, over that at their
-    own pixels; NaN with too few edges.
+def _agreement(edges: tuple[Ints, Ints, Floats32], colour: Bytes, camera: Camera) -> tuple[float, float]:
+    """Logarithms of the mean gradient of colour at depth edges as a Kinect's colour camera sees them, and at their own
+    pixels, over that of the whole image; NaN with too few edges.
     """
-    change, (v, u, nearer_m) = change_along_rows(colour), depth_edges(depth_m)
+    change, (v, u, nearer_m) = change_along_rows(colour), edges
     far = _at_infinity(np.asarray(u + 0.5, float), v.astype(float), camera)
     columns = np.round(far[0] - COLOUR_FOCAL * BASELINE_M / nearer_m).astype(np.int64)
     rows = np.round(far[1]).astype(np.int64)
     inside = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
     if inside.sum() < FEWEST_EDGES:
-        return float("nan")
+        return float("nan"), float("nan")
+    usual = change.mean() + LEAST_CHANGE
     beside, here = change[rows[inside], columns[inside]].mean(), change[v[inside], u[inside]].mean()
-    return float(np.log((beside + LEAST_CHANGE) / (here + LEAST_CHANGE)))
+    return float(np.log((beside + LEAST_CHANGE) / usual)), float(np.log((here + LEAST_CHANGE) / usual))
 
 
 def _at_infinity(u: Floats, v: Floats, camera: Camera) -> tuple[Floats, Floats]:

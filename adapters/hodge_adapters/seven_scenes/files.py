@@ -6,7 +6,7 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -106,6 +106,20 @@ def with_depth(
     lost = (Note("images missing", len(missing), f"{total} depth images"),) * (len(missing) > MISSING * total)
     unpaired = unpaired_doubts(["color" in files.paths for files in usable]) if len(colourless) < len(usable) else ()
     return usable, (*lost, *unpaired)
+
+
+def with_colour_of(usable: Sequence[FrameFiles], late: int) -> list[FrameFiles]:
+    """The frames, each with the colour image of the one so many frames later in its sequence; without where there is
+    none.
+    """
+    paired = list[FrameFiles]()
+    for row, files in enumerate(usable):
+        other = usable[row + late] if 0 <= row + late < len(usable) else None
+        paths = {what: path for what, path in files.paths.items() if what != "color"}
+        if other is not None and other.sequence == files.sequence and "color" in other.paths:
+            paths["color"] = other.paths["color"]
+        paired.append(replace(files, paths=paths))
+    return paired
 
 
 def _list_numbers(folder: Path) -> dict[int, dict[str, Path]]:

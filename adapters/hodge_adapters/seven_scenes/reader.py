@@ -23,6 +23,7 @@ from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_
 from hodge_adapters.images.frames import as_jpeg, image_frame
 from hodge_adapters.seven_scenes.colour import (
     DepthFile,
+    frames_late,
     is_unregistered,
     read_depth,
     read_registered_colour,
@@ -35,12 +36,15 @@ from hodge_adapters.seven_scenes.files import (
     sequence_folders,
     sequence_number,
     split_numbers,
+    with_colour_of,
     with_depth,
 )
 from hodge_adapters.text_rows import listed
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Camera, Floats, Frame, Source, Trajectory
+from hodge_pipeline.types.notes import Note
+from hodge_pipeline.types.text import counted
 
 VIDEO_HZ = 30.0
 """A Kinect's frames a second, which the files' numbers count."""
@@ -99,6 +103,8 @@ class SevenScenesReader:
         camera, camera_files = self._camera(path, usable, notes)
         colours = [files.paths.get("color") for files in usable]
         colour_size = pixels.colour_size(colours, (camera.width, camera.height), notes)
+        images = sorted(file for files in usable for file in files.paths.values())
+        usable, late = self._paired(usable, camera)
         is_unregistered = self._is_unregistered(usable, camera, notes)
         poses = read_poses(usable, notes)
         several = len({files.sequence for files in usable}) > 1
@@ -111,9 +117,9 @@ class SevenScenesReader:
             ),
             trajectory=None if several else _trajectory(usable, poses),
             notes=tuple(notes),
-            doubts=doubts,
+            doubts=(*doubts, *late),
             numbered_hz=VIDEO_HZ,
-            files=(*camera_files, *(file for files in usable for file in sorted(files.paths.values()))),
+            files=(*camera_files, *images),
         )
 
     def _chosen(self, path: Path, notes: list[str]) -> list[tuple[str, Path]]:
@@ -153,6 +159,20 @@ class SevenScenesReader:
         depth = [files.paths["depth"] for files in usable]
         camera = found.camera_of(depth, notes)
         return camera, tuple(beside[:1])
+
+    def _paired(self, usable: list[FrameFiles], camera: Camera) -> tuple[list[FrameFiles], tuple[Note, ...]]:
+        """The frames, each with the colour of its moment, and a note where the files have that of another.
+
+        Colour of a camera beside the depth camera alone: registered colour is tried by who runs the sequence.
+        """
+        if self.colour_camera == "same":
+            return usable, ()
+        depth = [self._depth(files, camera) for files in usable]
+        late = frames_late([files.paths.get("color") for files in usable], depth)
+        if not late:
+            return usable, ()
+        told = f"{counted(abs(late), 'frame')} {'later' if late > 0 else 'earlier'}"
+        return with_colour_of(usable, late), (Note("colour paired anew", late, told),)
 
     def _is_unregistered(self, usable: Sequence[FrameFiles], camera: Camera, notes: list[str]) -> bool:
         """Whether colour is unregistered, of a Kinect's colour camera beside the depth camera."""
