@@ -55,6 +55,15 @@ def test_the_verdict_follows_the_scores(before_m: float, after_m: float, outcome
     assert words in verdict.sentence
 
 
+@pytest.mark.parametrize(("share", "says"), [(0.5, False), (0.75, True), (1.0, True)])
+def test_where_nothing_confirms_most_edges_the_first_line_says_so(report: Report, share: float, says: bool) -> None:
+    assert report.graph is not None
+    graph = replace(report.graph, edges=4, verdicts={"untestable": int(4 * share)})
+    verdict = judge(replace(report, graph=graph))
+    assert verdict.headline.startswith(f"Nothing confirms {int(4 * share)} of 4 edges: ") == says
+    assert verdict.mark == ("mixed" if says else "improved")
+
+
 def test_errors_that_disagree_are_mixed(report: Report) -> None:
     verdict = judge(replace(report, scores=scored(0.01, 0.01, 0.02)))
     assert verdict.outcome == "mixed"

@@ -11,6 +11,7 @@ import numpy as np
 from hodge_pipeline.evaluation.difference import MEASURABLE, Change
 from hodge_pipeline.report.contents import GRAPH_NAMES, Report
 from hodge_pipeline.report.suspicions import other_scale, unsettled, wrong_edges
+from hodge_pipeline.types.notes import Note
 
 Outcome: TypeAlias = Literal["improved", "unchanged", "worse", "mixed", "not measured"]
 
@@ -33,6 +34,7 @@ LEADS = {
     "unsettled": "not settled",
     "tracking lost": "tracking was lost at {count} of {frames} frames",
     "images unread": "{count} of {frames} frames have images that cannot be read",
+    "untestable": "nothing confirms {count} of {detail} edges",
 }
 REASONS = {
     "camera or object": "images contradict the camera's motion",
@@ -55,7 +57,7 @@ REASONS = {
 of `in doubt, since …` (`REASONS`), whatever the measures say."""
 OF_MOST = {"tracking lost", "images unread"}
 MOSTLY_LOST = 0.5
-"""The share of the frames."""
+"""The share of the frames; of edges that nothing confirms, of the edges."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,8 @@ def judge(report: Report) -> Verdict:
         all_joined = report.source.unordered and len(report.pieces) == 1 and outcome in ("improved", "unchanged")
         headline = pieces if all_joined else f"{pieces}: {headline[:1].lower()}{headline[1:]}"
     told = sorted(
-        (*unsettled(report), *other_scale(report), *report.notes, *wrong_edges(report)), key=lambda note: note.rank
+        (*unsettled(report), *other_scale(report), *report.notes, *wrong_edges(report), *_mostly_untestable(report)),
+        key=lambda note: note.rank,
     )
     apart = {"left apart"} if len(report.pieces) > 1 else set()  # then nothing joins them, and the headline says so
     reasons = " and ".join(REASONS[note.kind] for note in told if note.kind in REASONS.keys() - apart)
@@ -118,6 +121,14 @@ def judge(report: Report) -> Verdict:
     doubts += [report.refinement.doubt] if report.refinement and report.refinement.doubt else []
     headline = capital(": ".join(f"{text[:1].lower()}{text[1:]}" for text in (*doubts, headline)))
     return Verdict(outcome, headline, details, changes, max(len(report.pieces), 1), reason, bool(doubts))
+
+
+def _mostly_untestable(report: Report) -> Iterator[Note]:
+    """A note where nothing confirms most edges, as in a tree."""
+    graph = report.graph
+    count = 0 if graph is None else graph.verdicts.get("untestable", 0)
+    if graph is not None and count > MOSTLY_LOST * graph.edges:
+        yield Note("untestable", count, str(graph.edges))
 
 
 def _judged(report: Report, changes: tuple[Change, ...]) -> tuple[Outcome, str, str]:
