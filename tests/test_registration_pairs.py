@@ -20,8 +20,9 @@ from hodge_pipeline.registration.gicp import Gicp, Vgicp
 from hodge_pipeline.registration.odometry import OdometryOptions, odometry
 from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.registration.register import register_edges
+from hodge_pipeline.registration.tracking.bridging import bridge
 from hodge_pipeline.stages import Registrar, Step, Workers
-from hodge_pipeline.types import CloudSet, Edges, Floats, PointCloud
+from hodge_pipeline.types import CloudSet, Edges, Floats, PointCloud, Registration
 from test_executors import dask_workers
 from test_registration import corner
 
@@ -233,6 +234,21 @@ def test_empty_frames_are_bridged_and_a_lost_one_is_said(tmp_path: Path) -> None
     assert np.abs(se3.log(se3.inverse(poses[good]) @ found.world_from_cam[good])).max() < 0.02
     assert np.array_equal(found.world_from_cam[3], found.world_from_cam[2])
     assert np.abs(se3.log(se3.inverse(poses[7]) @ found.world_from_cam[7])).max() < 0.05  # constant velocity
+
+
+@pytest.mark.parametrize(("share", "pairs"), [(0.0, [[0, 1], [1, 2]]), (0.4, [[0, 1]])])
+def test_a_break_of_tracking_is_bridged_by_what_free_space_does_not_refute(
+    share: float, pairs: list[list[int]], folder: Path
+) -> None:
+    poses = path_of(3)
+    motions = zip(se3.between(poses, np.array([[0, 1], [1, 2]])), (1.0, 0.0), strict=True)
+    found = [Registration(motion, np.eye(6), fitness, 0.01, 100, 1, True) for motion, fitness in motions]
+    steps = Edges.of([[0, 1], [1, 2]], "sequential").with_registrations(found)
+    with HERE.open() as workers:
+        held, _ = bridge(
+            folder, [np.arange(3)], steps, poses, OdometryOptions(), workers, lambda edges: np.full(len(edges), share)
+        )
+    assert held.pairs[:, 1].tolist() == [pair[1] for pair in pairs]
 
 
 def test_over_a_hole_in_the_recording_a_step_must_be_sure(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
