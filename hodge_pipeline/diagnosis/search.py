@@ -120,13 +120,12 @@ class Trial:
     """A motion (4, 4) of the world that a group of edges proposes for the views `movable (V,)`, into a piece.
 
     - `layers (3, P)`: of all pairs after the motion of the second view; `held (V,)`: the gain in upright log-evidence.
-    - `is_apart`: whether the views come from another piece; `beside`: views that the edges join them to.
+    - `beside`: views that the edges join them to.
     """
 
     motion: Floats
     piece: int
     movable: Bools
-    is_apart: bool
     layers: Floats
     held: Floats
     beside: Ints
@@ -143,7 +142,7 @@ class Trial:
             up = np.broadcast_to(here.up[stayer], here.up.shape)
             held = here.held(motion[:3, :3] @ rotations, up) - here.held(rotations, here.up)
             layers = layers * (piece[here.pairs[:, 0]] == home)
-            out.append(cls(motion, int(home), piece == moving, bool(home != moving), layers, held, beside))
+            out.append(cls(motion, int(home), piece == moving, layers, held, beside))
         return out
 
 
@@ -151,8 +150,6 @@ def _best_moves(here: Placements, trials: list[Trial]) -> list[Move]:
     """The best set of views to move for each trial."""
     out = []
     for trial, sets in zip(trials, _cuts(here, trials), strict=True):
-        if trial.is_apart:
-            sets = np.concatenate([sets, trial.movable[None]])
         gains = [_gain(here, trial, inside) for inside in sets]
         best = int(np.argmax(gains))
         out.append(Move(gains[best], sets[best], trial.motion, trial.piece, trial.beside))
