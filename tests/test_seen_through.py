@@ -10,7 +10,7 @@ import pytest
 from hodge_pipeline import se3
 from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.registration.acceptance import SEEN_THROUGH, Acceptance, accepted, with_odometry
-from hodge_pipeline.registration.global_evidence import MOST_VIOLATION
+from hodge_pipeline.registration.assessment import MOST_VIOLATION
 from hodge_pipeline.registration.odometry import OdometryOptions, odometry
 from hodge_pipeline.registration.seen_through import seen_through
 from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, PointCloud, Registration

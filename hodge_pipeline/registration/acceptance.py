@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_pipeline.registration.assessment import SAME_FITNESS
-from hodge_pipeline.registration.global_evidence import MOST_VIOLATION
+from hodge_pipeline.registration.assessment import MOST_VIOLATION, SAME_FITNESS
 from hodge_pipeline.registration.odometry_path import contradicts_odometry, without_slides
 from hodge_pipeline.registration.sliding import consecutive, weak_directions
 from hodge_pipeline.scene import Drift

@@ -19,11 +19,6 @@ VIEW_WIDTH = 160
 """Pixels across a small depth image, one in 4 of 640."""
 CLOUD_VIEW_WIDTH = 80
 """Pixels across the view of a cloud: with their neighbours they are as wide as its voxels, 3 cm, at 1.5 m."""
-MOST_VIOLATION = 0.15
-"""The share of the points in view that the other depth image may have seen through. Places that look alike differ in
-what surrounds them. Of pairs that GICP registered, of red kitchen's every 20th to 40th frame and fr1/rpy's every third,
-none of 975 within 12 cm of the truth has more, and 16 of 19 others have.
-"""
 MARGIN_M, MARGIN_PER_M2 = 0.06, 0.006
 """Depth noise of structured light grows with the square of the distance; a match is off by centimetres."""
 NEAREST_M = 0.1

@@ -12,9 +12,9 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
+from hodge_pipeline.registration.assessment import MOST_VIOLATION
 from hodge_pipeline.registration.gaps import over_gap
 from hodge_pipeline.registration.gicp import Gicp
-from hodge_pipeline.registration.global_evidence import MOST_VIOLATION
 from hodge_pipeline.registration.pairs import prepared_clouds
 from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress

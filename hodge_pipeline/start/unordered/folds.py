@@ -15,7 +15,7 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import Diagnosis
-from hodge_pipeline.registration.global_evidence import MOST_VIOLATION
+from hodge_pipeline.registration.assessment import MOST_VIOLATION
 from hodge_pipeline.start.unordered.hypotheses import ViewOf, violations
 from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, ViewGraph
 from hodge_pipeline.types.arrays import evenly

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.acceptance import SEEN_THROUGH
+from hodge_pipeline.registration.assessment import MOST_VIOLATION
 from hodge_pipeline.registration.colour_evidence import hue_conflicts
-from hodge_pipeline.registration.global_evidence import MOST_VIOLATION, DepthView, violation
+from hodge_pipeline.registration.global_evidence import DepthView, violation
 from hodge_pipeline.registration.global_pairs import Matches
 from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.registration.sliding import weak_directions
