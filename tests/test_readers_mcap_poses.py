@@ -7,6 +7,7 @@ import pytest
 
 from hodge_adapters.mcap.reader import McapReader
 from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import inspect
 from hodge_pipeline.testing import check_reader
 from hodge_pipeline.types import Floats
@@ -127,6 +128,20 @@ def test_transforms_in_time_are_interpolated_along_the_chain(tmp_path: Path, enc
         np.testing.assert_allclose(in_map.frames[row].world_from_cam, map_from_odom @ expected, atol=1e-6)
     assert len(in_map.trajectory) == 4
     assert "poses of cam_optical in map from the transforms" in in_map.notes
+
+
+def test_of_transforms_alone_the_frames_that_move_are_named(tmp_path: Path) -> None:
+    log, poses = Log(), some_poses(2, seed=1)
+    fixed = (5.0, "map", "dock", poses[0])
+    log.add(
+        "/tf", "tf2_msgs/msg/TFMessage", transforms(fixed, *((row, "map", "base", poses[row]) for row in (0, 1))), CDR
+    )
+    path = log.write(tmp_path / "log.mcap")
+    with pytest.raises(SourceError, match="transforms move base: name one for its poses, --set .*pose_child=base$"):
+        McapReader().open(path)
+    trajectory = McapReader(pose_child="base").open(path).trajectory
+    assert trajectory is not None
+    np.testing.assert_allclose(trajectory.world_from_cam, poses, atol=1e-9)
 
 
 def test_odometry_of_a_real_robot(data_dir: Path) -> None:

@@ -80,7 +80,7 @@ def test_a_folder_of_nothing_known_says_so(tmp_path: Path) -> None:
         ("points3D.txt", "one file of a COLMAP model: give its folder"),
         ("database.db", "give the folder of a model, with --database for this one"),
         ("gt.info", "give the .log beside it"),
-        ("drive.bag", "a ROS 1 bag of another format than 2.0"),
+        ("drive.bag", "the file is empty"),
         ("drive.mcap.zstd", "packed: unpack it first"),
         ("bag.tar.xz", "packed: unpack it first"),
     ],
@@ -89,6 +89,13 @@ def test_a_file_that_is_nearly_a_source(tmp_path: Path, name: str, advice: str) 
     for part in ("cameras.txt", "images.txt", name):
         (tmp_path / part).write_text("")
     assert advice in complaint(tmp_path / name)
+
+
+def test_an_old_bag_is_told_from_what_is_no_bag(tmp_path: Path) -> None:
+    (tmp_path / "old.bag").write_text("#ROSBAG V1.2\n")
+    (tmp_path / "other.bag").write_bytes(bytes(range(256)))
+    assert "a ROS 1 bag of another format than 2.0" in complaint(tmp_path / "old.bag")
+    assert "no reader knows this format" in complaint(tmp_path / "other.bag")
 
 
 @pytest.mark.parametrize("ending", ["bin", "txt"])

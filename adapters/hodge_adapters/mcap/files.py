@@ -42,7 +42,7 @@ def sniff_recording(path: Path) -> Sniff:
                     return Sniff(1.0, f"starts as {kind}")
             if begins == SQLITE_MAGIC and path.suffix == ".db3":
                 return Sniff(0.9, "an SQLite file called .db3, as ROS 2 bags are")
-            return Sniff(0.0, "does not start as an MCAP file", _other_recording(path))
+            return Sniff(0.0, "does not start as an MCAP file", _other_recording(path, begins))
         if path.is_dir() and (there := _there(path)):
             is_bag = (path / METADATA).is_file()
             return Sniff(0.9, METADATA) if is_bag else Sniff(0.7, f"a folder with {there[0].suffix} files")
@@ -97,11 +97,11 @@ def _listed(metadata: Path, notes: list[str]) -> list[Path]:
     return [path for path in dict.fromkeys(paths) if path]
 
 
-def _other_recording(path: Path) -> str:
+def _other_recording(path: Path, begins: bytes) -> str:
     """What to do with a file that is nearly a recording, empty for any other."""
     if path.name == METADATA and _there(path.parent):
         return f"the list of a bag's files: give its folder {path.parent}"
-    if path.suffix == ".bag":
+    if begins.startswith(b"#ROSBAG"):
         return "a ROS 1 bag of another format than 2.0: `rosbag migrate` or `rosbag reindex` makes one of it"
     packed = ".mcap." in path.name or path.name.endswith((".tar", ".tar.gz", ".tar.xz", ".tar.zst", ".zip", ".7z"))
     return "packed: unpack it first" if packed else ""

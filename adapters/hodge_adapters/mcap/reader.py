@@ -76,7 +76,9 @@ class McapReader:
         0.02, ge=0, description="seconds between the stamps of a depth image and its colour image, as for TUM"
     )
     pose_topic: str = Field("", description="topic of odometry or poses; empty: odometry first, else transforms")
-    pose_child: str = Field("", description="coordinate frame that the pose topic moves; empty: as its messages say")
+    pose_child: str = Field(
+        "", description="coordinate frame that the pose topic, or transforms alone, move; empty: as messages say"
+    )
     world_frame: str = Field("", description="take poses from the transforms to this frame; empty: odometry's frame")
     max_gap_s: float = Field(
         0.2, ge=0, description="seconds to the neighbours that a pose is interpolated from; odometry often has 10 Hz"
@@ -276,6 +278,8 @@ def _nothing(path: Path, recording: Recording) -> SourceError:
     remedy = "record depth images, point clouds or odometry"
     if any(name.rpartition("/")[2] in RAW_SCANS for name in recording.topics.values()):
         remedy = "these are a scanner's own packets: record its driver's PointCloud2"
+    elif moving := recording.transforms.moving():
+        remedy = f"transforms move {listed(moving)}: name one for its poses, --set source.reader.pose_child={moving[0]}"
     if not recording.topics:
         return SourceError(f"{path}: holds no message{why}: {remedy}")
     return SourceError(f"{path}: no depth, clouds, images or poses in {_topics(recording)}{why}: {remedy}")

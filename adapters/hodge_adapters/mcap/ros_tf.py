@@ -73,6 +73,10 @@ class TransformTree:
     def __contains__(self, frame: str) -> bool:
         return frame in self._parent or frame in self._parent.values()
 
+    def moving(self) -> list[str]:
+        """The frames that were sent in time, by name."""
+        return sorted(frame for frame in self._links if not self._holds_always(frame))
+
     def root(self, frame: str) -> str:
         """The frame at the top of this one's chain."""
         return self._chain(frame)[-1]
