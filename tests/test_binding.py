@@ -78,6 +78,16 @@ def test_a_stage_by_name_has_its_defaults(tmp_path: Path) -> None:
             "source: {reader: tum, depth_scale: 1000}\n",
             "r.yaml:6: source.depth_scale: unknown option (did you mean 'source.reader.depth_scale'?)",
         ),
+        (
+            "start: {stage: odometry, registration: null}\n",
+            "r.yaml:6: start.registration: expected {stage: NAME, …} with a NAME of: coloured_icp",
+        ),
+        ("seed: -1\n", "r.yaml:6: seed: expected a whole number from 0, got -1"),
+        ("source: {path: [a, b]}\n", "r.yaml:6: source.path: expected a path, got ['a', 'b']"),
+        (
+            "suggestions: {among: {stage: combined, builders: []}}\n",
+            "suggestions.among.builders: expected more items, got ()",
+        ),
         ("scale: big\n", "r.yaml:6: scale: expected number or 'auto', got 'big'"),
         (
             "source: {reader: {stage: tum, camera: [525, 525]}}\n",

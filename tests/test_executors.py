@@ -17,6 +17,7 @@ import psutil
 import pytest
 
 from hodge_pipeline.errors import SourceError, WorkerError
+from hodge_pipeline.executors import local
 from hodge_pipeline.executors.dask import cluster_workers
 from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.stages import Workers
@@ -154,6 +155,12 @@ def test_workers_have_one_thread_and_both_work() -> None:
     with LocalExecutor(workers=2).open() as workers:
         assert {value for _, value in workers.map(thread_limit, range(4))} == {"1"}
         assert os.getpid() not in {pid for _, pid in workers.map(process_id, range(4))}
+
+
+def test_there_are_no_more_workers_than_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local, "_cores", lambda: 1)
+    with LocalExecutor(workers=10**9).open() as workers:
+        assert workers._count == 1
 
 
 def test_a_worker_that_dies_with_nothing_to_do_is_replaced() -> None:

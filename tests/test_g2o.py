@@ -138,7 +138,7 @@ def test_of_a_switched_loop_beside_steps_without_information_the_motion_is_read(
         ("EDGE_SE3_SWITCHABLE 1 2 3 0 0", ":2: EDGE_SE3_SWITCHABLE needs 28 numbers after its ids, has 2"),
         ("EDGE_SE3:QUAT 1 2 0 0 0", ":2: EDGE_SE3:QUAT needs 28 numbers after its ids, has 3"),
         (EDGE.replace("1 2 3", "1 two 3"), ":2: 'two' is no number"),
-        (EDGE.replace("7 3", "7 x3"), ":2: 'x3' is no 64-bit integer id"),
+        (EDGE.replace("7 3", "7 x3"), ":2: 'x3' is no id of EDGE_SE3:QUAT: give a whole number of 64 bits"),
         (EDGE.replace("0 0 0 1 1", "0 0 0 0 1"), ":2: its quaternion is zero"),
         (EDGE.replace("1 2 3", "1 nan 3"), ":2: EDGE_SE3:QUAT holds a nan"),
         (EDGE + " 5", ":2: EDGE_SE3:QUAT needs 28 numbers after its ids, has 29"),

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ast
+import bz2
+import gzip
+import lzma
 import os
 import sqlite3
 import struct
@@ -55,6 +58,14 @@ def test_a_pointer_of_git_lfs_is_told(name: str, tmp_path: Path) -> None:
     path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0a1b\nsize 12345\n")
     with pytest.raises(SourceError, match="is a pointer of Git LFS, not the file itself: run git lfs pull"):
         inspect(path)
+
+
+@pytest.mark.parametrize("name", ["graph.g2o", "poses.tum"])
+def test_a_compressed_file_is_told_whatever_it_is_called(name: str, tmp_path: Path) -> None:
+    for compressor, compressed in (("gzip", gzip.compress), ("bzip2", bz2.compress), ("xz", lzma.compress)):
+        (tmp_path / name).write_bytes(compressed(b"EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n"))
+        with pytest.raises(SourceError, match=f"is compressed by {compressor}: unpack it first"):
+            inspect(tmp_path / name)
 
 
 def test_a_file_is_read_to_its_limit(tmp_path: Path) -> None:

@@ -217,6 +217,12 @@ def test_where_no_edge_says_anything_nothing_is_called_solved(tmp_path, ring, ho
     np.testing.assert_array_equal(load_g2o(tmp_path / "out.g2o").trajectory.world_from_cam[:, 0, 3], [0, 1, 2])
 
 
+def test_what_reader_and_solver_both_note_is_told_once(tmp_path: Path) -> None:
+    edge = "EDGE_SE2 0 {} 1 0 0 1 0 0 1 0 1\n"
+    (tmp_path / "in.g2o").write_text(edge.format(1) + edge.format(0))
+    assert hodge(tmp_path / "in.g2o", "--out", tmp_path / "out.g2o").count("to itself") == 1
+
+
 def test_an_odometry_that_states_nothing_of_some_axes_is_told(tmp_path: Path) -> None:
     step = "EDGE_SE2 {} {} 1 0 0.01 1000 0 0 1000 0 0.001"
     lines = [step.format(k, k + 1) for k in range(9)] + ["EDGE_SE2 0 9 9 0.1 0 1000 0 0 1000 0 1000"]

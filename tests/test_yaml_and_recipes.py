@@ -25,6 +25,8 @@ def test_plain_values_and_their_lines() -> None:
         ("a: 1\na: 2", "bad.yaml:2: found duplicate key"),
         ("a: [1", "bad.yaml:1"),
         ("- 1", "a recipe is a mapping"),
+        ("a: 1\n---\nb: 2", "bad.yaml:2: expected a single document in the stream, but found another document"),
+        ("a:\n\tb: 1", "cannot start any token: indent with blanks"),
         ("1: 2", "the key 1 is not a name"),
         ("a: 2026-01-01", "a value of type date"),
         ("a: \0", "bad.yaml: not YAML: unacceptable character"),
@@ -80,6 +82,12 @@ def test_what_would_fill_the_stack_or_a_line_is_refused(text: str, expected: str
     assert "\n" not in str(refused.value)
 
 
+def test_text_in_another_encoding_is_told(tmp_path: Path) -> None:
+    (tmp_path / "latin.yaml").write_bytes(b"a: caf\xe9\n")
+    with pytest.raises(RecipeError, match=r"latin\.yaml: no text in UTF-8 at byte 6: save it as UTF-8$"):
+        yaml_file.read(tmp_path / "latin.yaml")
+
+
 def test_a_huge_file_is_not_read(tmp_path: Path) -> None:
     path = tmp_path / "huge.yaml"
     path.write_text("a: " + "x" * yaml_file.MAX_BYTES)
@@ -124,6 +132,12 @@ def test_extends_in_a_circle_is_refused(recipes: Path) -> None:
     (recipes / "a.yaml").write_text("extends: b.yaml\n")
     (recipes / "b.yaml").write_text("extends: a.yaml\n")
     with pytest.raises(RecipeError, match="extends"):
+        recipe_file.load(str(recipes / "a.yaml"))
+
+
+def test_what_extends_no_recipe_is_told_where_it_says_so(recipes: Path) -> None:
+    (recipes / "a.yaml").write_text("seed: 1\nextends: /etc/passwd\n")
+    with pytest.raises(RecipeError, match=r"a\.yaml:2: extends: /etc/passwd: is no recipe"):
         recipe_file.load(str(recipes / "a.yaml"))
 
 

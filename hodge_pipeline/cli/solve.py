@@ -131,7 +131,7 @@ def _lines(
     else:
         lines += [line for note in summary["notes"][:NOTES] for line in at_most(labelled("note", note), 1)]
         if (left := len(summary["notes"]) - NOTES) > 0:
-            lines.append(f"  - … and {left} more notes: --verbose")
+            lines.append(f"  - … and {counted(left, 'more note')}: --verbose")
     time = f"{summary['wall_s']:.3f} s, {summary['cpu_s']:.3f} CPU s, {counted(summary['newton_steps'], 'step')}"
     lines.append(f"{'time':<{LABEL}}{time}")
     lines += [f"{'written':<{LABEL}}{out}"] if out is not None else []

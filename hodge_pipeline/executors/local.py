@@ -39,14 +39,16 @@ class LocalExecutor:
     """
 
     workers: int | None = Field(
-        None, ge=0, description="processes; none: one for each core; 0: no process, the blocks run in this one"
+        None,
+        ge=0,
+        description="processes, at most one for each core; none: as many; 0: no process, the blocks run in this one",
     )
     retries: int = Field(2, ge=0, description="how often a block is tried again whose worker died")
 
     @contextmanager
     def open(self) -> Iterator[Workers]:
         """Workers that start with the first task and end at once when the context is left."""
-        count = _cores() if self.workers is None else self.workers
+        count = _cores() if self.workers is None else min(self.workers, _cores())
         if count == 0:
             yield InProcess()
             return

@@ -22,6 +22,8 @@ Where = Callable[[Keys], str]
 """Gives `file:line` of a path of keys."""
 WORDS = {float: "number", int: "whole number", bool: "true or false", str: "text", type(None): "nothing"}
 """Types in the words of an error."""
+IN_WORDS = {"path_type": "expected a path", "too_short": "expected more items"}
+"""What pydantic says of a wrong value in words of its own code, said in those of a recipe."""
 KIND = "x-stage-kind"
 """The key that marks a stage of a kind in a schema that is not linked yet."""
 
@@ -44,6 +46,9 @@ def bind(cls: type[T], data: Any, where: Where, keys: Keys = (), *, seed: int | 
             raise RecipeError(f"{where(here)}: {_dotted(here)}: unknown option{suggestion}", here)
     if isinstance(data.get("seed"), int):
         seed = data["seed"]
+        if seed < 0:  # here, not at the stage that it would reach first
+            here = (*keys, "seed")
+            raise RecipeError(f"{where(here)}: {_dotted(here)}: expected a whole number from 0, got {seed}", here)
     elif "seed" in known and seed is not None:
         data = {**data, "seed": seed}
     values = {key: _value(known[key], value, where, (*keys, key), seed) for key, value in data.items()}
@@ -97,7 +102,7 @@ def _without(data: Any, keys: Keys) -> Any:
 
 def _value(annotation: Any, value: Any, where: Where, keys: Keys, seed: int | None) -> Any:
     """A field's value with its stages and sections built; anything else is left to pydantic."""
-    if value is None:
+    if value is None and not registry.kind_of(annotation):
         return None
     if get_origin(annotation) in (typing.Union, types.UnionType):
         inner = [arg for arg in get_args(annotation) if registry.kind_of(arg) or _is_section(arg)]
@@ -207,7 +212,7 @@ def _first_error(error: ValidationError, where: Where, keys: Keys, known: Mappin
     here = (*keys, *(key for key in first["loc"] if isinstance(key, (str, int))))
     while len(here) > len(keys) and isinstance(here[-1], str) and "-" in here[-1]:
         here = here[:-1]
-    what = first["msg"][0].lower() + first["msg"][1:]
+    what = IN_WORDS.get(first["type"]) or first["msg"][0].lower() + first["msg"][1:]
     if first["type"] == "missing":
         return RecipeError(f"{where(keys)}: {_dotted(here)}: this option is required", keys)
     if first["type"] == "value_error":  # a stage's own words; its input is no option's value

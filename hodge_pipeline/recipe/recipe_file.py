@@ -81,9 +81,10 @@ def _extended(path: Path, depth: int) -> Document:
     if not isinstance(parent, str) or depth == MAX_EXTENDS:
         raise RecipeError(f"{where}: extends: expected the name of a recipe, in a chain of at most {MAX_EXTENDS}")
     try:
-        base = _extended(find(parent, beside=path.parent), depth + 1)
+        found = find(parent, beside=path.parent)
     except RecipeError as error:
-        raise error if ":" in str(error).split(" ")[0] else RecipeError(f"{where}: extends: {error}") from error
+        raise RecipeError(f"{where}: extends: {error}") from error
+    base = _extended(found, depth + 1)
     merged = _merged(base.data, document.data)
     inherited = {keys: line for keys, line in base.origins.items() if _exists(merged, keys)}
     return Document(merged, {**inherited, **document.origins})

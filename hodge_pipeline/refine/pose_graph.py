@@ -118,7 +118,7 @@ class SolvedFile:
             "cg_steps": int(metrics["cg_steps"]),
             "cpu_s": self.cpu_s,
             "wall_s": self.wall_s,
-            "notes": [*self.source.notes, *self.solution.notes],
+            "notes": list(dict.fromkeys((*self.source.notes, *self.solution.notes))),
         }
 
 

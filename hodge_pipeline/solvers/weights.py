@@ -69,7 +69,9 @@ def edge_weights(graph: ViewGraph, dimension: int) -> Weights:
     loops = graph.edges[:, 0] == graph.edges[:, 1]
     used = ((kappa > 0) | (tau > 0)) & ~loops
     if loops.any():
-        notes.append(f"{counted(int(loops.sum()), 'edge joins|edges join')} a vertex to itself: ignored")
+        notes.append(
+            f"{counted(int(loops.sum()), 'edge joins|edges join')} a vertex to itself: they say nothing of poses"
+        )
     silent, stated = ~used & ~loops, information.any(axis=(1, 2))
     for count, what in ((silent & ~stated, "no information"), (silent & stated, "information that is not positive")):
         if count.any():

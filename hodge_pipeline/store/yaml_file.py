@@ -50,7 +50,7 @@ def read(path: Path) -> Document:
     except OSError as error:
         raise RecipeError(f"{path}: no recipe that can be read ({error.strerror}): give another file") from error
     except UnicodeDecodeError as error:
-        raise RecipeError(f"{path}: cannot be read: {error}") from error
+        raise RecipeError(f"{path}: no text in UTF-8 at byte {error.start}: save it as UTF-8") from error
     return parse(text, str(path))
 
 
@@ -72,7 +72,11 @@ def _parsed(text: str, name: str) -> Document:
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark else 1
-        raise RecipeError(f"{name}:{line}: {str(error.problem).splitlines()[0]}") from error
+        problem = str(error.problem).splitlines()[0]
+        if problem.startswith("but "):  # ruamel's problem is then the second half of a sentence
+            problem = f"{error.context}, {problem}"
+        remedy = ": indent with blanks" if r"'\t'" in problem else ""
+        raise RecipeError(f"{name}:{line}: {problem}{remedy}") from error
     except AttributeError as error:  # of ruamel, at `&a {<<: *a}`
         raise RecipeError(f"{name}: not YAML: a mapping is merged into itself") from error
     except (YAMLError, ValueError, RecursionError) as error:

@@ -13,6 +13,8 @@ MAX_WHOLE_BYTES = 1 << 31
 """The longest file that is read whole: 2 GiB of text are 20 million edges, or a model of 10,000 images."""
 _LFS_HEAD, _LFS_BYTES = b"version https://git-lfs", 1024
 """How a pointer of Git LFS, in the place of the file itself, begins, and a length that it stays below."""
+_COMPRESSED = {b"\x1f\x8b\x08": "gzip", b"\x28\xb5\x2f\xfd": "zstd", b"\xfd7zXZ\0": "xz", b"BZh91AY&SY": "bzip2"}
+"""How what a compressor writes begins; no format that is read begins so, whatever the file is called."""
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _KINDS = {
     stat.S_IFDIR: (errno.EISDIR, "a folder"),
@@ -24,8 +26,9 @@ _KINDS = {
 
 
 def open_input(path: Path) -> BinaryIO:
-    """The file, open for reading bytes. Raises `OSError` for one that is missing, a pointer of Git LFS or not regular.
+    """The file, open for reading bytes.
 
+    Raises `OSError` for one that is missing, not regular, compressed, or a pointer of Git LFS.
     A pipe would wait for a writer and a device never end, so the kind of file is checked before opening, and after.
     """
     try:
@@ -36,7 +39,11 @@ def open_input(path: Path) -> BinaryIO:
     try:
         status = os.fstat(handle)
         _check_regular(path, status.st_mode)
-        if status.st_size < _LFS_BYTES and os.pread(handle, len(_LFS_HEAD), 0) == _LFS_HEAD:
+        begins = os.pread(handle, len(_LFS_HEAD), 0)
+        for magic, compressor in _COMPRESSED.items():
+            if begins.startswith(magic):
+                raise OSError(errno.ENODATA, f"is compressed by {compressor}: unpack it first", str(path))
+        if status.st_size < _LFS_BYTES and begins == _LFS_HEAD:
             raise OSError(errno.ENODATA, "is a pointer of Git LFS, not the file itself: run git lfs pull", str(path))
         return os.fdopen(handle, "rb")
     except BaseException:

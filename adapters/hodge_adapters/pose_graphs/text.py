@@ -10,6 +10,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from hodge_adapters.text_rows import reading
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -68,9 +69,11 @@ def read_records(
 
     A tag that is among the `other_names` is read as the one it stands for.
     """
+    with reading(path):
+        contents = read_input(path)
     try:
-        text = _text(read_input(Path(path)))
-    except (OSError, ValueError) as error:
+        text = _text(contents)
+    except ValueError as error:
         raise SourceError(f"{path}: cannot be read as text ({error}): expected a pose-graph file") from error
     numbers: dict[str, list[int]] = {tag: [] for tag in keys}
     rests: dict[str, list[str]] = {tag: [] for tag in keys}
@@ -126,7 +129,7 @@ def _integers(path: Path, tag: str, numbers: Sequence[int], keys: list[list[str]
     except (ValueError, OverflowError):
         words = ((number, key) for number, row in zip(numbers, keys, strict=True) for key in row)
         number, key = next(word for word in words if not _is(np.int64, word[1]))
-        raise SourceError(f"{path}:{number}: {key!r} is no 64-bit integer id of a {tag}") from None
+        raise SourceError(f"{path}:{number}: {key!r} is no id of {tag}: give a whole number of 64 bits") from None
     return flat.reshape(-1, width)
 
 
