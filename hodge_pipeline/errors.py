@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from errno import EDQUOT, ENOSPC
 from pathlib import Path
 
 
@@ -58,5 +59,8 @@ class CheckError(HodgeError):
 
 def not_written(path: Path, error: OSError) -> WorkspaceError:
     """What a file that the system refuses to write is told as."""
-    remedy = ": is its folder there?" if isinstance(error, (FileNotFoundError, NotADirectoryError)) else ""
-    return WorkspaceError(f"{path}: cannot be written ({error.strerror or error}){remedy}")
+    if isinstance(error, (FileNotFoundError, NotADirectoryError)):
+        remedy = "is its folder there?"
+    else:
+        remedy = "make room, or write elsewhere" if error.errno in (ENOSPC, EDQUOT) else "write elsewhere"
+    return WorkspaceError(f"{path}: cannot be written ({error.strerror or error}): {remedy}")

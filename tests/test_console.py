@@ -11,6 +11,7 @@ from rich.progress import Task
 
 from hodge_pipeline.cli import console
 from hodge_pipeline.cli.console import ProgressBars, RateColumn
+from hodge_pipeline.report.brief import at_most, labelled
 from hodge_pipeline.types.notes import Note
 
 
@@ -84,3 +85,9 @@ def test_bars_with_rates_in_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: 
 def test_the_rate_of_a_stage_of_many_units(speed: float | None, total: int, shown: str) -> None:
     task = SimpleNamespace(finished_speed=None, speed=speed, total=total)
     assert RateColumn().render(cast(Task, task)).plain == shown
+
+
+def test_a_line_that_is_cut_keeps_what_stands_after_a_colon() -> None:
+    lines = labelled("look", "an edge of the backbone, which is trusted: no loop that is confirmed passes over it")
+    (cut,) = at_most(lines, 1)
+    assert cut.endswith("trusted: no loop that is confirmed …") and len(cut) <= 80

@@ -1,12 +1,13 @@
 """The run folder: whose it is, refusal, and the files in it."""
 
+import errno
 import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hodge_pipeline.errors import WorkspaceError
+from hodge_pipeline.errors import WorkspaceError, not_written
 from hodge_pipeline.store import artifacts, codec
 from hodge_pipeline.store.workspace import Workspace
 from hodge_pipeline.types import Solution, SolverIteration, ViewGraph
@@ -67,6 +68,19 @@ def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "run").write_text("a file")
     with pytest.raises(WorkspaceError, match="cannot be written"):
         Workspace.open(tmp_path / "run", RECIPE)
+
+
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [
+        (errno.ENOSPC, "make room, or write elsewhere"),
+        (errno.EROFS, "write elsewhere"),
+        (errno.ENOENT, "is its folder there?"),
+    ],
+)
+def test_what_cannot_be_written_says_what_to_do(number: int, remedy: str) -> None:
+    told = str(not_written(Path("out.g2o"), OSError(number, os.strerror(number))))
+    assert told == f"out.g2o: cannot be written ({os.strerror(number)}): {remedy}"
 
 
 def test_a_name_that_is_not_utf_8_is_one_line(tmp_path: Path) -> None:

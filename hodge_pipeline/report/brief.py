@@ -66,5 +66,5 @@ def at_most(lines: list[str], count: int) -> list[str]:
     if len(lines) <= count:
         return lines
     cut = f"{lines[count - 1]} {lines[count].strip()}"[: COLUMNS - 1].rsplit(" ", 1)[0]
-    clause = max(f"{cut} ".rfind(mark) for mark in (": ", "; ", ", "))
+    clause = max(f"{cut} ".rfind(mark) for mark in ("; ", ", "))
     return [*lines[: count - 1], f"{cut[:clause] if clause >= COLUMNS / 2 else cut} …"]

@@ -167,7 +167,7 @@ def _reasons(resistance: Floats, tests: Ints) -> tuple[str, ...]:
             text = "joins two pieces"
         else:
             after = np.sqrt(value / (1 + value))
-            text = f"sigma of their relative pose falls from {np.sqrt(value):.2g} to {after:.2g} times one edge's"
+            text = f"sigma between them falls from {np.sqrt(value):.2g} to {after:.2g} times one edge's"
         if number:
             text = f"tests {counted(number, 'untestable edge')}; {text}"
         lines.append(text)

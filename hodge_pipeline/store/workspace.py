@@ -129,7 +129,7 @@ def holding(folder: Path) -> Iterator[None]:
     try:
         lock = _open_lock(folder)
     except OSError as error:
-        raise WorkspaceError(f"{folder}: cannot be written ({error.strerror})") from error
+        raise WorkspaceError(f"{folder}: cannot be written ({error.strerror}): copy it to where it can be") from error
     with lock:
         hold(lock, _in_use(folder))
         yield
