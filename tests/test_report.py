@@ -153,8 +153,11 @@ def test_the_worst_frame_is_the_one_of_the_largest_error_of_all_frames(report: R
     poses[4, 1, 3] = 0.3
     (row,) = trajectory_rows({"result": poses}, truth, names=[f"f{number}" for number in range(6)])
     assert row.worst == "f4"
-    places = worst_places(replace(report, trajectories=(row,)))
-    assert next(places) == f"Frame f4 lies {report.length(row.ate_max_m)} off the truth, more than any other."
+    rows = (row, replace(row, name="before", ate_rmse_m=3.0))
+    places = worst_places(replace(report, after="result", trajectories=rows))
+    assert next(places) == f"Frame f4 lies {row.ate_max_m:.3g} m off the truth, more than any other.", (
+        "in the table's unit"
+    )
 
 
 def test_a_length_has_no_unit_where_none_is_known(report: Report) -> None:

@@ -60,11 +60,11 @@ def pointed(text: str) -> list[str]:
 
 
 def at_most(lines: list[str], count: int) -> list[str]:
-    """The first lines, the last of them ending in … where there are more: after a clause of at least half a line, or
+    """The first lines, the last of them ending in … where there are more: after a clause of ¾ of a line at least, or
     else after a word.
     """
     if len(lines) <= count:
         return lines
     cut = f"{lines[count - 1]} {lines[count].strip()}"[: COLUMNS - 1].rsplit(" ", 1)[0]
-    clause = max(f"{cut} ".rfind(mark) for mark in ("; ", ", "))
-    return [*lines[: count - 1], f"{cut[:clause] if clause >= COLUMNS / 2 else cut} …"]
+    clause = max(f"{cut} ".rfind(mark) for mark in (": ", "; ", ", "))
+    return [*lines[: count - 1], f"{cut[:clause] if clause >= COLUMNS * 3 / 4 else cut} …"]

@@ -24,7 +24,9 @@ def worst_places(report: Report) -> Iterator[str]:
     errors = offsets(report).get(report.after)
     of_all = next((row for row in report.trajectories if row.name == report.after and row.worst), None)
     if of_all is not None and not report.shows_rejected:
-        yield f"Frame {of_all.worst} lies {report.length(of_all.ate_max_m)} off the truth, more than any other."
+        beside = max(row.ate_rmse_m for row in report.trajectories if row.frames)  # whose unit the table's ATEs have
+        off = report.length(of_all.ate_max_m, beside)
+        yield f"Frame {of_all.worst} lies {off} off the truth, more than any other."
     elif errors is not None and len(report.pictures.names) == len(errors):
         size = np.linalg.norm(errors, axis=1)
         row = int(np.nanargmax(size))
