@@ -21,6 +21,9 @@ MOST_BODIES_JOINTLY = 300
 MOST_POINTS_AT_ONCE = 16384
 """Whose part of the joint normal matrix is in memory at once."""
 STEP = 1e-6
+LEAST_DISTANCE = 1e-4
+"""Share of the median distance of points from cameras. A nearer one, as a robust loss leaves on a camera's centre,
+weighs 1e8 times as much: what is left of it once it is eliminated is rounding."""
 LEAST_SEEN = 3
 """Observations that fix a pose."""
 
@@ -39,11 +42,11 @@ class _Rows:
 def information(model: Model, bodies: Bodies) -> PoseInformation:
     """What the tracks tell of the bodies' poses, whatever their points are.
 
-    From the size of the residuals, wrong observations left out (see `error_cap`). A body with fewer than `LEAST_SEEN`
-    observations takes no part: what is free beside the gauge would be mistaken for it.
+    From the size of the residuals; wrong observations (see `error_cap`) and points on a camera are left out. A body
+    with fewer than `LEAST_SEEN` observations takes no part: what is free beside the gauge would be mistaken for it.
     """
     errors_px, body = reprojection_errors(model), bodies.body_of_image[model.image_rows]
-    right = errors_px <= error_cap(errors_px)
+    right = (errors_px <= error_cap(errors_px)) & _are_apart(model)
     seen = np.bincount(body[right], minlength=len(bodies.frame_ids)) >= LEAST_SEEN
     used, count = right & seen[body], int(seen.sum())
     points = np.count_nonzero(np.bincount(model.points.owners[used]))
@@ -53,6 +56,13 @@ def information(model: Model, bodies: Bodies) -> PoseInformation:
     variance = max(float((errors_px[used] ** 2).sum()) / freedom, np.finfo(float).tiny)
     schur = _schur(model, bodies, used, np.cumsum(seen) - 1, count)
     return PoseInformation(seen, (schur[None] if schur.ndim == 2 else schur) / variance)
+
+
+def _are_apart(model: Model) -> Bools:
+    """Which entries of tracks (T,) have their point farther from the camera than `LEAST_DISTANCE`."""
+    centres = np.array([image.world_from_cam[:3, 3] for image in model.images]).reshape(-1, 3)
+    away = np.linalg.norm(model.points.xyz[model.points.owners] - centres[model.image_rows], axis=1)
+    return np.asarray(away > LEAST_DISTANCE * np.median(away)) if len(away) else np.zeros(0, bool)
 
 
 def _schur(model: Model, bodies: Bodies, used: Bools, number_of: Ints, count: int) -> Floats:
