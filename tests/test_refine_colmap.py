@@ -169,6 +169,32 @@ def test_a_model_of_few_points_is_no_better_for_a_billionth_of_a_pixel() -> None
     assert "known to" not in str(forced.decision.change)
 
 
+def test_a_point_on_a_camera_fixes_no_pose() -> None:
+    """As a robust loss leaves one that two wrong observations share: it would outweigh all others."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 4, 60
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(options)
+    (whole,) = ColmapModels(database="none").open_models([model])
+    key = min(model.points3D)
+    element = model.points3D[key].track.elements[0]
+    image = model.images[element.image_id]
+    ray = se3.inverse(np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]))[:3, 2]
+    model.points3D[key].xyz = image.projection_center() + 1e-12 * ray
+    image.points2D[element.point2D_idx].xy = image.project_point(model.points3D[key].xyz)
+    (touching,) = ColmapModels(database="none").open_models([model])
+    errors = [one.information.standard_errors for one in (whole, touching)]
+    assert np.isfinite(errors[1]).all() and (errors[1] > 0.5 * np.median(errors[0], axis=0)).all()
+
+
+def test_a_large_model_is_adjusted_by_one_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """COLMAP takes all cores from 50,000 numbers on, whose sums then have no order: no two results were the same."""
+    create = Mock(side_effect=pycolmap.create_default_bundle_adjuster)
+    monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", create)
+    ColmapModels().open_models(noisy(tmp_path))[0].adjusted()
+    assert [call.args[0].ceres.solver_options.num_threads for call in create.call_args_list] == [1]
+
+
 def test_an_optimal_model_is_given_back_byte_for_byte(tmp_path: Path) -> None:
     model = noisy(tmp_path)
     done = hodge_pipeline.refine_colmap(model, out=tmp_path / "out", overrides=FREE)

@@ -130,6 +130,7 @@ def _adjuster(
 def _options(refine: Refine) -> pycolmap.BundleAdjustmentOptions:
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
+    options.ceres.solver_options.num_threads = 1  # of several the order of sums, and so the result, is left to chance
     options.refine_focal_length = refine in ("focal", "all")
     options.refine_principal_point = options.refine_extra_params = refine == "all"
     options.refine_sensor_from_rig = refine == "rig"
