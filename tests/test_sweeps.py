@@ -25,7 +25,15 @@ from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.registration import scan_to_map
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.scan_to_map import ScanToMap
-from hodge_pipeline.registration.sweeps import deskewed, deskewed_frame, turned
+from hodge_pipeline.registration.sweeps import (
+    BACKWARDS,
+    FORWARDS,
+    UNUSED,
+    deskewed,
+    deskewed_frame,
+    turned,
+    turns_by_order,
+)
 from hodge_pipeline.sources.frame_facts import frame_facts
 from hodge_pipeline.stages import Step, Steps, no_progress
 from hodge_pipeline.start.sweeps import Sweeps, deskewed_along, follow, key_rows
@@ -66,7 +74,7 @@ def once(what: Callable[..., object]) -> Callable[..., object]:
 def warm_up_once() -> Iterator[None]:
     """What the first of the same sweeps tell is found once: it is most of what following so few sweeps costs."""
     with pytest.MonkeyPatch.context() as patch:
-        for what in (scan_to_map.first_velocity, scan_to_map.is_backwards):
+        for what in (scan_to_map.first_velocity, scan_to_map.sense_of_times):
             patch.setattr(f"hodge_pipeline.start.sweeps.{what.__name__}", once(what))
         yield
 
@@ -103,6 +111,11 @@ def followed(
     source = Source("street", Path("street"), tuple(frames))
     every = (np.arange(len(frames)),) if sequences is None else sequences
     return follow(source, every, CloudOptions(max_range_m=max_range_m, voxel_m=0.5), None, step=step), "\n".join(said)
+
+
+def without_order(cloud: PointCloud) -> PointCloud:
+    """The points, lowest first, without times."""
+    return PointCloud(cloud.points_in_cam[np.argsort(cloud.points_in_cam[:, 2])])
 
 
 def test_sweeps_after_unread_ones_are_followed() -> None:
@@ -201,8 +214,7 @@ def test_given_poses_of_sweeps_without_times_are_told_and_those_of_stations_are_
     apart_s: float, told: list[str]
 ) -> None:
     frames = [
-        changed(replace(frame, stamp_s=UNIX_S + row * apart_s), lambda cloud: replace(cloud, times_s=None))
-        for row, frame in enumerate(corner()[:4])
+        changed(replace(frame, stamp_s=UNIX_S + row * apart_s), without_order) for row, frame in enumerate(corner()[:4])
     ]
     source, notes = Source("sweeps", Path("sweeps"), tuple(frames)), list[Note]()
     steps = cast(Steps, SimpleNamespace(note=notes.append))
@@ -212,9 +224,9 @@ def test_given_poses_of_sweeps_without_times_are_told_and_those_of_stations_are_
 
 def test_times_that_run_backwards_are_turned_in_all_sweeps_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
     right, _ = followed(street())
-    monkeypatch.setattr("hodge_pipeline.start.sweeps.is_backwards", lambda *_: True)
+    monkeypatch.setattr("hodge_pipeline.start.sweeps.sense_of_times", lambda *_: BACKWARDS)
     found, said = followed([changed(frame, turned) for frame in street()])
-    assert "seem to run backwards" in said and "24 of 24 sweeps" in said and found.backwards.all()
+    assert "seem to run backwards" in said and "24 of 24 sweeps" in said and (found.sense == BACKWARDS).all()
     np.testing.assert_allclose(found.world_from_scan, right.world_from_scan, atol=1e-3)
 
 
@@ -237,11 +249,11 @@ def test_a_repeated_sweep_gets_the_pose_of_its_copy_and_stops_nothing() -> None:
 
 def test_after_a_minute_without_sweeps_a_scanner_may_have_stopped() -> None:
     frames = [
-        changed(replace(frame, stamp_s=UNIX_S + row * REVOLUTION_S), lambda cloud: replace(cloud, times_s=None))
+        changed(replace(frame, stamp_s=UNIX_S + row * REVOLUTION_S), without_order)
         for row, frame in enumerate(street()[14::-1])  # backwards, so that it ends where the scanner stands
     ]
     standing = SpinningScanner(Road(1e-9), 0, beams=16, columns=360, noise=1.0).sweep(0)
-    frames.append(Frame("later", UNIX_S + 60, read_points=lambda: PointCloud(standing.points)))
+    frames.append(Frame("later", UNIX_S + 60, read_points=lambda: without_order(PointCloud(standing.points))))
     found, said = followed(frames)
     assert "the recording stops for 58.6 s before later" in said
     moved = found.world_from_scan[-1, :3, 3] - found.world_from_scan[-2, :3, 3]
@@ -280,17 +292,46 @@ class Turning(CarFree):
 def test_a_turn_from_the_first_sweep_on_is_followed() -> None:
     own = SpinningScanner(cast(Road, Turning()), 0, beams=16, columns=360, noise=1.0)
     found, _ = followed(frames_of([own.sweep(number) for number in range(COUNT)]))
-    assert not found.backwards.any()
+    assert (found.sense == FORWARDS).all()
     exact = Turning().world_from_car(np.arange(COUNT) * REVOLUTION_S)
     assert absolute_error(found.world_from_scan, exact).max_m < NEAR_M
 
 
-def test_times_that_run_backwards_are_told_by_the_points_on_the_map() -> None:
-    scanner = SpinningScanner(Road(15.0), 0, beams=16, columns=360, noise=1.0)
-    right = [PointCloud(sweep.points, times_s=sweep.times_s) for sweep in map(scanner.sweep, range(20))]
-    for clouds, is_turned in ((right, False), ([turned(cloud) for cloud in right], True)):
+def test_times_that_run_backwards_or_are_of_deskewed_points_are_told_by_the_points_on_the_map() -> None:
+    scanner = SpinningScanner(Road(20.0), 0, beams=16, columns=360, noise=1.0)
+    right = [PointCloud(sweep.points, times_s=sweep.times_s) for sweep in map(scanner.sweep, range(12))]
+    velocity = np.array([0, 0, 0, 20.0, 0, 0])
+    flat = [replace(cloud, points_in_cam=deskewed(cloud, velocity).points_in_cam) for cloud in right]
+    for clouds, sense in ((right, FORWARDS), ([turned(cloud) for cloud in right], BACKWARDS), (flat, UNUSED)):
         given = [(row, row * REVOLUTION_S, cloud) for row, cloud in enumerate(clouds)]
-        assert scan_to_map.is_backwards(0.5, np.array([0, 0, 0, 15.0, 0, 0]), given) is is_turned
+        assert scan_to_map.sense_of_times(0.5, velocity, False, given) == sense
+
+
+def test_the_order_of_points_tells_how_a_scanner_spun_and_no_other_order_does() -> None:
+    read = street()[3].read_points
+    assert read is not None
+    cloud = read()
+    assert cloud.times_s is not None
+    points, turns = cloud.points_in_cam, cloud.times_s / REVOLUTION_S
+    got = turns_by_order(points)
+    assert got is not None and np.abs(got - got[0] - (turns - turns[0])).max() < 0.02
+    lost = (turns < 0.3) | (turns > 0.55)
+    got = turns_by_order(points[lost])
+    assert got is not None and np.quantile(np.abs(got - (turns - turns[0])[lost]), 0.99) < 0.02
+    rings = np.argsort(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])).round(3), kind="stable")
+    for order in (rings, np.argsort(points[:, 0]), np.random.default_rng(0).permutation(len(points))):
+        assert turns_by_order(points[order]) is None
+    assert turns_by_order(points[turns < 0.3]) is None  # such as the columns of a camera's image
+
+
+def test_points_without_times_in_the_order_of_a_scanner_are_deskewed_by_it() -> None:
+    right, _ = followed(street())
+    found, said = followed([changed(frame, lambda cloud: replace(cloud, times_s=None)) for frame in street()])
+    assert "points of 24 of 24 sweeps have no times" in said and "their times are told by it" in said
+    assert absolute_error(found.world_from_scan, true_poses(range(COUNT))).max_m < NEAR_M
+    np.testing.assert_allclose(found.velocity, right.velocity, atol=0.3)
+    few, said = followed([changed(frame, lambda cloud: replace(cloud, times_s=None)) for frame in street()[:6]])
+    assert (few.sense == UNUSED).all() and "each is taken as measured in an instant" in said
 
 
 def test_names_of_times_are_seconds_in_their_order(tmp_path: Path) -> None:
@@ -342,7 +383,7 @@ def test_key_frames_begin_and_end_with_sweeps_that_were_found() -> None:
     poses[:, 0, 3] = 0.4 * np.arange(12)
     at_hand = np.arange(12) % 7 > 0  # without the first and the seventh
     at_hand[9:] = False
-    found = Sweeps(poses, np.zeros((12, 6)), at_hand, np.zeros(12, bool), 40.0)
+    found = Sweeps(poses, np.zeros((12, 6)), at_hand, np.zeros(12), np.ones(12, np.int64), 40.0)
     assert key_rows(found, (np.arange(9), np.arange(9, 12)), 1.0, 15.0).tolist() == [1, 4, 8]
 
 

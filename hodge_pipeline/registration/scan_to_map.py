@@ -11,7 +11,7 @@ import small_gicp
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.assessment import MIN_POINTS
-from hodge_pipeline.registration.sweeps import deskewed, turned
+from hodge_pipeline.registration.sweeps import BACKWARDS, FORWARDS, UNUSED, deskewed, retimed
 from hodge_pipeline.types import Floats, Floats32, Ints, PointCloud
 
 START_LEVELS, LEVELS = (9, 3, 1), (3, 1)
@@ -54,8 +54,8 @@ simulated corridor steps of 16 beams scattered by 0.1 m and claimed 3 mm.
 MOST_PASSES = 4
 """Passes over the first sweeps, forwards and backwards, for their velocity, at most."""
 SURE, FEWEST_TIMED = 4.0, 10
-"""Standard errors by which more points lie on the map where times run backwards, over as many of the first sweeps and
-more, before they are taken so: of 63 simulated sequences with right times none
+"""Standard errors by which more points lie on the map where times run backwards, or are unused, over as many of the
+first sweeps and more, before they are taken so: of 63 simulated sequences with right times none
 reaches it, of the same turned 28.
 """
 MOST_DESKEWS, FARTHER = 3, 0.9
@@ -208,15 +208,26 @@ def first_velocity(voxel_m: float, sweeps: Sequence[tuple[int, float, PointCloud
     return ends[(len(ends) - 1) // 2 * 2], strange
 
 
-def is_backwards(voxel_m: float, velocity: Floats, sweeps: Sequence[tuple[int, float, PointCloud]]) -> bool:
-    """Whether clearly more points of these first sweeps, which began with this velocity, lie on the map where the times
-    of points are turned: right times put points where they were, wrong ones blur the map.
+def sense_of_times(
+    voxel_m: float, velocity: Floats, by_order: bool, sweeps: Sequence[tuple[int, float, PointCloud]]
+) -> int:
+    """The sense of the times of points in these sweeps, which began with this velocity: `FORWARDS`, unless clearly more
+    points lie on the map where times are turned or unused: right times put points where they were, wrong ones blur it.
+
+    Times by the order of points are unused where the sweeps are too few to tell: they may be single scans at rest.
     """
-    if len(sweeps) < FEWEST_TIMED or all(cloud.times_s is None for _, _, cloud in sweeps):
-        return False
-    told = _shares(voxel_m, velocity, sweeps)
-    gain = _shares(voxel_m, velocity, [(row, at, turned(cloud)) for row, at, cloud in sweeps]) - told
-    return bool(np.nanmean(gain) > SURE * np.nanstd(gain, ddof=1) / np.sqrt(len(gain)))
+    if all(cloud.times_s is None for _, _, cloud in sweeps):
+        return FORWARDS
+    if len(sweeps) < FEWEST_TIMED:
+        return UNUSED if by_order else FORWARDS
+    told, best, sense = _shares(voxel_m, velocity, sweeps), 0.0, FORWARDS
+    for other in (BACKWARDS, UNUSED):
+        changed = [(row, at, retimed(cloud, 0.0, other)) for row, at, cloud in sweeps]
+        gain = _shares(voxel_m, velocity, changed) - told
+        mean = float(np.nanmean(gain))
+        if mean > max(best, SURE * np.nanstd(gain, ddof=1) / np.sqrt(len(gain))):
+            best, sense = mean, other
+    return sense
 
 
 def _shares(voxel_m: float, velocity: Floats, sweeps: Sequence[tuple[int, float, PointCloud]]) -> Floats:

@@ -10,10 +10,22 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.scene import UNIX_STAMP_S
-from hodge_pipeline.types import Floats, Frame, PointCloud
+from hodge_pipeline.types import Floats, Floats32, Frame, PointCloud
 
 STEPS_A_SWEEP = 64
 """Motions that a revolution is cut into: 1.6 cm each at 10 m/s and 10 revolutions a second."""
+FORWARDS, BACKWARDS, UNUSED = 1, -1, 0
+"""Senses of the times of points: as told or by their order; the other way; sweeps were deskewed before."""
+BLOCKS, FEWEST_IN_BLOCK = 128, 4
+"""Blocks of points, in their order, that tell how a scanner spun: 3 degrees each, wider than the azimuths at which the
+lasers of one firing look apart."""
+NARROW = 0.9
+"""Length of the mean of a block's directions, at the median, below which it is of all around: 0.9 is of 90 degrees."""
+SLACK = 0.1
+"""Revolution that noise turns a block back by at most; what seems to turn back farther went on round."""
+LEAST_TURNS, MOST_TURNS = 0.5, 1.5
+"""Revolutions of a sweep: a planar scanner sees 0.7, some drivers cut after 1.1; ring after ring there are as many as
+rings, row after row of a camera's image none."""
 
 
 def deskewed(cloud: PointCloud, velocity: Floats, after_s: float = 0.0) -> PointCloud:
@@ -43,15 +55,29 @@ def turned(cloud: PointCloud) -> PointCloud:
     return replace(cloud, times_s=cloud.times_s.max() - cloud.times_s)
 
 
-def turned_frame(frame: Frame) -> Frame:
-    """The frame, the times of its points turned whenever they are read."""
-    if frame.read_points is None:
+def timed_by_order(cloud: PointCloud, revolution_s: float) -> PointCloud:
+    """The cloud with times by the order of its points, for a scanner that spins once in so many seconds; unchanged
+    where the order is not that of a revolution.
+    """
+    turns = turns_by_order(cloud.points_in_cam)
+    return cloud if turns is None else replace(cloud, times_s=turns * np.float32(revolution_s), first_s=0.0)
+
+
+def retimed(cloud: PointCloud, revolution_s: float, sense: int = FORWARDS) -> PointCloud:
+    """The cloud whose points have times by their order (see `timed_by_order`; 0: their own) in this sense."""
+    cloud = timed_by_order(cloud, revolution_s) if revolution_s else cloud
+    return {FORWARDS: cloud, BACKWARDS: turned(cloud), UNUSED: replace(cloud, times_s=None)}[sense]
+
+
+def retimed_frame(frame: Frame, revolution_s: float, sense: int = FORWARDS) -> Frame:
+    """The frame, its points retimed whenever they are read (see `retimed`)."""
+    if frame.read_points is None or (not revolution_s and sense == FORWARDS):
         return frame
-    return replace(frame, read_points=partial(_read_turned, frame.read_points))
+    return replace(frame, read_points=partial(_read_retimed, frame.read_points, revolution_s, sense))
 
 
-def _read_turned(read: Callable[[], PointCloud]) -> PointCloud:
-    return turned(read())
+def _read_retimed(read: Callable[[], PointCloud], revolution_s: float, sense: int) -> PointCloud:
+    return retimed(read(), revolution_s, sense)
 
 
 def first_after_s(cloud: PointCloud, stamp_s: float) -> float:
@@ -86,3 +112,28 @@ def velocities(poses: Floats, times_s: Floats) -> Floats:
     before, behind = np.maximum(here - 1, 0), np.minimum(here + 1, len(poses) - 1)
     moved = se3.log(se3.inverse(poses[before]) @ poses[behind])
     return np.asarray(moved / (times_s[behind] - times_s[before])[:, None])
+
+
+def turns_by_order(points: Floats32) -> Floats32 | None:
+    """Revolutions (N,) of the scanner from the first of the points (N, 3) to each, where their order is that in which
+    a scanner that spins about z measured them; None where it is another, as ring after ring.
+
+    Azimuths of blocks that follow each other turn one way, through about one revolution. Points without a return have
+    no azimuth.
+    """
+    seen = np.flatnonzero((points[:, 0] != 0) | (points[:, 1] != 0))
+    if len(seen) < FEWEST_IN_BLOCK * BLOCKS:
+        return None
+    firsts = np.linspace(0, len(seen), BLOCKS, endpoint=False).astype(np.int64)
+    counts = np.diff(np.append(firsts, len(seen)))
+    x, y = points[seen, 0].astype(float), points[seen, 1].astype(float)
+    towards = np.add.reduceat((x + 1j * y) / np.hypot(x, y), firsts) / counts
+    steps = np.angle(towards[1:] / towards[:-1]) / (2 * np.pi)
+    steps *= np.sign(np.median(steps)) or 1.0
+    steps = np.where(steps < -SLACK, steps + 1, steps)  # a gap of more than half a revolution
+    if np.median(np.abs(towards)) < NARROW or not LEAST_TURNS <= steps.sum() <= MOST_TURNS:
+        return None
+    turns = np.append(0, np.cumsum(np.maximum(steps, 0)))
+    at = np.append(seen[firsts + counts // 2], len(points) - 1)
+    turns = np.append(turns, turns[-1] + np.median(steps) / 2)
+    return np.asarray(np.interp(np.arange(len(points)), at, turns), np.float32)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
 from typing import NamedTuple
@@ -14,13 +14,21 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.registration.cloud_set import FACTOR_OF_UNITS, shortened
-from hodge_pipeline.registration.clouds import CloudOptions, Oddity, in_range, make_cloud, out_of_range, reach_m
+from hodge_pipeline.registration.cloud_set import shortened
+from hodge_pipeline.registration.clouds import CloudOptions, Oddity
 from hodge_pipeline.registration.gaps import told_gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, OdometryOptions, chained
 from hodge_pipeline.registration.pairs import register_pairs
-from hodge_pipeline.registration.scan_to_map import ScanToMap, first_velocity, followed, is_backwards
-from hodge_pipeline.registration.sweeps import deskewed_frame, first_after_s, turned_frame, velocities
+from hodge_pipeline.registration.scan_to_map import ScanToMap, first_velocity, followed, sense_of_times
+from hodge_pipeline.registration.sweeps import (
+    BACKWARDS,
+    FORWARDS,
+    UNUSED,
+    deskewed_frame,
+    first_after_s,
+    retimed_frame,
+    velocities,
+)
 from hodge_pipeline.scene import (
     KeyFrames,
     Scene,
@@ -35,7 +43,16 @@ from hodge_pipeline.stages import Advance, Step, Steps, Workers
 from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
-from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Floats32, Frame, Ints, PointCloud, Source
+from hodge_pipeline.start.sweep_reading import (
+    LEFT_OUT,
+    NO_CLOCK_S,
+    Look,
+    begun_s,
+    first_look,
+    read_sweeps,
+    timed_sweeps,
+)
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Ints, PointCloud, Source
 from hodge_pipeline.types.notes import Note, notes_of
 
 VOXELS_IN_REACH, KEY_FRAMES_IN_REACH = 100, 40
@@ -45,32 +62,26 @@ SMALLEST_VOXEL_M = 0.08
 """Four times the usual noise of a range, 2 cm: smaller voxels, as in a room, would hold noise in place of surfaces."""
 WARM_UP = 20
 """Sweeps that the first velocity is found on."""
-LEFT_OUT = "the sweep is left out"
 STRANGE = "it fits none of the sweeps around it, and these fit each other: is it of another place?"
 MOST_LOOSE = 0.5
 """Share of sweeps that tell little of how far the scanner went, above which the whole path is in doubt."""
-LOOKS = 9
-"""Sweeps, spread over a sequence, that tell how far its scanner sees: any one may face a wall."""
-MOST_SKIPPED = 20
-"""Revolutions, 2 s of most scanners: numbers of files that are farther apart as a rule count something else."""
 STEPS_AROUND = 5
 """Steps before and after a sweep for its median velocity: half a second, in which a car hardly changes its speed."""
-NO_CLOCK_S = 1.0
-"""Time of a step where neither stamps nor times of points give one: velocities are then per sweep."""
 
 
 @plain_dataclass(frozen=True)
 class Sweeps:
     """Poses (N, 4, 4) of all sweeps at their stamps, their velocities (N, 6), and which (N,) were read.
 
-    `backwards` (N,) is where the times of points are turned;
+    `revolution_s` and `sense` (N,) are how the times of points are read (`retimed_frame`);
     `reach_m` is how far the scanner sees: 99 % of a usual sweep's points are nearer.
     """
 
     world_from_scan: Floats
     velocity: Floats
     found: Bools
-    backwards: Bools
+    revolution_s: Floats
+    sense: Ints
     reach_m: float
 
 
@@ -93,8 +104,10 @@ class SweepsStart(OdometryStart):
         sequences = tuple(sequences_of(source).values())
         found = steps.step(follow, source, sequences, clouds, self.voxel_m, title="sweeps", total=len(source.frames))
         timed = [
-            turned_frame(frame) if is_turned else frame
-            for frame, is_turned in zip(source.frames, found.backwards, strict=True)
+            retimed_frame(frame, revolution_s, sense)
+            for frame, revolution_s, sense in zip(
+                source.frames, found.revolution_s.tolist(), found.sense.tolist(), strict=True
+            )
         ]
         frames = tuple(map(deskewed_frame, timed, found.velocity))
         whole = replace(source, frames=frames)
@@ -127,11 +140,12 @@ def follow(
     count, stamps = len(source.frames), stamps_of(source)
     poses, velocity = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6))
     found, loose, parts = np.zeros(count, bool), np.zeros(count, bool), list[_Followed]()
-    backwards = np.zeros(count, bool)
+    revolution_s, sense = np.zeros(count), np.ones(count, np.int64)
     for rows in sequences:
         part = _follow_one([source.frames[row] for row in rows], stamps[rows], clouds, voxel_m, step.advance)
         poses[rows], velocity[rows] = part.world_from_scan, part.velocity
-        found[rows], loose[rows], backwards[rows] = part.found, part.loose, part.backwards
+        found[rows], loose[rows] = part.found, part.loose
+        revolution_s[rows], sense[rows] = part.revolution_s, part.sense
         parts.append(part)
     odd = [one for part in parts for one in part.odd]
     if not found.any():
@@ -145,17 +159,26 @@ def follow(
         step.note(Note(kind, int(loose.sum()), str(count)))
     clocked = [rows for rows in sequences if is_clock(stamps[rows])]
     step.note(*told_gaps(clocked, stamps, vertex_ids(source)))
-    if backwards.any():
-        step.note(Note("times backwards", int(backwards.sum()), str(count)))
+    step.note(*_notes_of_times(revolution_s, sense))
     if not any(part.is_timed for part in parts):
         step.note(Note("sweeps untimed"))
-    return Sweeps(poses, velocity, found, backwards, min(part.reach_m for part in parts))
+    return Sweeps(poses, velocity, found, revolution_s, sense, min(part.reach_m for part in parts))
+
+
+def _notes_of_times(revolution_s: Floats, sense: Ints) -> list[Note]:
+    """How many sweeps have times of points other than those told, by `retimed_frame`."""
+    counts = {
+        "times by order": (revolution_s > 0) & (sense != UNUSED),
+        "times backwards": sense == BACKWARDS,
+        "times unused": (revolution_s == 0) & (sense == UNUSED),
+    }
+    return [Note(kind, int(where.sum()), str(len(sense))) for kind, where in counts.items() if where.any()]
 
 
 class _Followed(NamedTuple):
     """One sequence: poses (M, 4, 4) at the stamps, velocities (M, 6), which (M,) sweeps were read, where (M,) the
-    alignment was loose; whether points have times, and these are turned; the reach of the scanner in metres; what is
-    odd.
+    alignment was loose; whether points have times; how these are read (`retimed_frame`); the reach of the scanner in
+    metres; what is odd.
     """
 
     world_from_scan: Floats
@@ -163,31 +186,35 @@ class _Followed(NamedTuple):
     found: Bools
     loose: Bools
     is_timed: bool
-    backwards: bool
+    revolution_s: float
+    sense: int
     reach_m: float
     odd: list[Oddity]
 
 
 def _follow_one(
-    frames: list[Frame], stamps_s: Floats, clouds: CloudOptions, voxel_m: float | None, advance: Advance
+    frames: Sequence[Frame], stamps_s: Floats, clouds: CloudOptions, voxel_m: float | None, advance: Advance
 ) -> _Followed:
     count, is_timed, rows, odd = len(frames), False, list[int](), list[Oddity]()
     poses, velocity, middle_s = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6)), np.zeros(count)
     found, loose, original = np.zeros(count, bool), np.zeros(count, bool), np.arange(count)
-    usual_m, usual_turn_s = _first_look(frames, clouds)
-    times = _times(stamps_s, usual_turn_s)
+    look = first_look(frames, stamps_s, clouds)
+    usual_m, revolution_s = look.reach_m, look.revolution_s
+    times = begun_s(stamps_s, look.turn_s)
     voxel = voxel_m or max(usual_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
-    warm_up = _timed_sweeps(frames[:WARM_UP], times, clouds, usual_m)
+    warm_up = timed_sweeps([retimed_frame(f, revolution_s) for f in frames[:WARM_UP]], times, clouds, usual_m)
     begun, strange = first_velocity(voxel, warm_up)
-    backwards = is_backwards(voxel, begun, [one for one in warm_up if one[0] not in strange])
-    if backwards:
-        frames = [turned_frame(frame) for frame in frames]
-        begun, strange = first_velocity(voxel, _timed_sweeps(frames[:WARM_UP], times, clouds, usual_m))
+    known = [one for one in warm_up if one[0] not in strange]
+    sense = sense_of_times(voxel, begun, revolution_s > 0, known)
+    frames = [retimed_frame(frame, revolution_s, sense) for frame in frames]
+    if sense != FORWARDS:
+        times = begun_s(stamps_s, look.turn_s if sense or not revolution_s else 0.0)
+        begun, strange = first_velocity(voxel, timed_sweeps(frames[:WARM_UP], times, clouds, usual_m))
     tracker = ScanToMap(voxel, begun)
 
     def read() -> Iterator[tuple[int, float, PointCloud]]:
         latest = 0
-        for row, sweep in enumerate(_sweeps(frames, clouds, usual_m)):
+        for row, sweep in enumerate(read_sweeps(frames, clouds, usual_m)):
             odd.extend([] if sweep.odd is None else [sweep.odd])
             original[row] = latest if sweep.is_copy else row
             if row in strange:
@@ -211,95 +238,49 @@ def _follow_one(
         last = np.maximum(np.searchsorted(rows, np.arange(count), side="right") - 1, 0)
         velocity = velocities(poses[rows], times[rows])[last]
         poses = poses[rows][last] @ se3.exp(-middle_s[rows][last][:, None] * velocity)  # to the stamp
-    return _Followed(poses, velocity, found, loose, is_timed, backwards, usual_m, odd)
-
-
-def _timed_sweeps(
-    frames: list[Frame], times: Floats, clouds: CloudOptions, usual_m: float
-) -> list[tuple[int, float, PointCloud]]:
-    """Row, time of its beginning and points of each sweep that can be read."""
-    every = enumerate(_sweeps(frames, clouds, usual_m))
-    return [(row, times[row], sweep.cloud) for row, sweep in every if sweep.cloud]
+    return _Followed(poses, velocity, found, loose, is_timed, revolution_s, sense, usual_m, odd)
 
 
 def deskewed_along(source: Source, world_from_scan: Floats, clouds: CloudOptions, steps: Steps) -> Source:
     """The source with sweeps whose points have times deskewed to their stamps, by velocities from poses (N, 4, 4).
 
-    The poses may be noisy: a velocity is the median over the steps around. Notes where sweeps in motion have no times.
+    The poses may be noisy: a velocity is the median over the steps around. Notes where sweeps in motion have no times,
+    or other ones than told.
     """
-    velocity, stamps, is_untimed = np.zeros((len(source.frames), 6)), stamps_of(source), False
+    count, stamps, is_untimed = len(source.frames), stamps_of(source), False
+    velocity, revolution_s, sense = np.zeros((count, 6)), np.zeros(count), np.ones(count, np.int64)
     for rows in sequences_of(source).values():
-        middle = source.frames[rows[len(rows) // 2]]
-        turn_s = _first_look([middle], clouds)[1] if middle.read_points is not None else 0.0
-        turns = len(rows) > 1 and is_clock(stamps[rows]) and np.median(np.diff(stamps[rows])) < NO_CLOCK_S
-        is_untimed |= bool(turns and not turn_s and middle.read_points is not None)
-        if turn_s and len(rows) > 1:
-            apart_s = np.diff(_times(stamps[rows], turn_s))
-            moved = se3.log(se3.inverse(world_from_scan[rows[:-1]]) @ world_from_scan[rows[1:]]) / apart_s[:, None]
+        frames = [source.frames[row] for row in rows]
+        if len(rows) < 2 or frames[len(rows) // 2].read_points is None:
+            continue
+        turns = is_clock(stamps[rows]) and np.median(np.diff(stamps[rows])) < NO_CLOCK_S
+        look = first_look(frames[len(rows) // 2 :][:1], stamps[rows], clouds)
+        if look.turn_s and (turns or not (look.revolution_s and is_clock(stamps[rows]))):
+            times = begun_s(stamps[rows], look.turn_s)
+            moved = se3.log(se3.inverse(world_from_scan[rows[:-1]]) @ world_from_scan[rows[1:]])
+            rates = moved / np.diff(times)[:, None]
             velocity[rows] = [
-                np.median(moved[max(0, row - STEPS_AROUND) : row + STEPS_AROUND], axis=0) for row in range(len(rows))
+                np.median(rates[max(0, row - STEPS_AROUND) : row + STEPS_AROUND], axis=0) for row in range(len(rows))
             ]
-    if is_untimed:
-        steps.note(Note("sweeps untimed"))
+            revolution_s[rows] = look.revolution_s
+            sense[rows] = _sense_along(frames, velocity[rows], times, clouds, look)
+        is_untimed |= bool(turns and not (look.turn_s and sense[rows[0]]))
+    for note in _notes_of_times(revolution_s, sense) + [Note("sweeps untimed")] * is_untimed:
+        steps.note(note)
     if not velocity.any():
         return source
-    return replace(source, frames=tuple(map(deskewed_frame, source.frames, velocity)))
+    timed = map(retimed_frame, source.frames, revolution_s.tolist(), sense.tolist())
+    return replace(source, frames=tuple(map(deskewed_frame, timed, velocity)))
 
 
-class _Sweep(NamedTuple):
-    """The points in range of a sweep, None where it cannot be read or repeats the one before it, and what is odd."""
-
-    cloud: PointCloud | None
-    odd: Oddity | None = None
-    is_copy: bool = False
-
-
-def _sweeps(frames: Iterable[Frame], clouds: CloudOptions, usual_m: float | None = None) -> Iterator[_Sweep]:
-    """Each sweep in range; without points where it cannot be read, repeats the last one, or has a reach far from
-    `usual_m`, which means other units.
-    """
-    before: Frame | None = None
-    points: Floats32 = np.zeros((0, 3), np.float32)
-    for frame in frames:
-        try:
-            # The points as measured; the cloud of a frame that has a depth image in their place.
-            cloud = make_cloud(frame, clouds)[0] if frame.read_points is None else frame.read_points()
-            near = in_range(cloud, clouds)
-        except (SourceError, OSError) as error:
-            yield _Sweep(None, Oddity(frame.frame_id, LEFT_OUT, str(error)))
-            continue
-        if not len(near):
-            yield _Sweep(None, Oddity(frame.frame_id, LEFT_OUT, out_of_range(cloud, clouds)))
-        elif usual_m is not None and not 1 / FACTOR_OF_UNITS < (reach := reach_m(cloud)) / usual_m < FACTOR_OF_UNITS:
-            why = f"it reaches {reach:.3g} m, the others {usual_m:.3g} m: has it other units (millimetres)?"
-            yield _Sweep(None, Oddity(frame.frame_id, LEFT_OUT, why))
-        elif before is not None and np.array_equal(near.points_in_cam, points):
-            why = f"it is given the pose of {before.frame_id}"
-            yield _Sweep(None, Oddity(frame.frame_id, "holds the same points as the sweep before it", why), True)
-        else:
-            before, points = frame, near.points_in_cam
-            yield _Sweep(near)
-
-
-def _first_look(frames: list[Frame], clouds: CloudOptions) -> tuple[float, float]:
-    """Median reach in metres and duration of a revolution in seconds (0: unknown) of a few sweeps; `max_range_m` where
-    none can be read.
-    """
-    looks = [s.cloud for s in _sweeps(frames[:: max(1, len(frames) // LOOKS)], clouds) if s.cloud is not None]
-    looks = looks or [s.cloud for s in _sweeps(frames, clouds) if s.cloud is not None][:1]
-    if not looks:
-        return clouds.max_range_m, 0.0
-    reach = np.median([reach_m(look) for look in looks])
-    return float(reach), float(np.median([0.0 if look.times_s is None else look.times_s.max() for look in looks]))
-
-
-def _times(stamps_s: Floats, turn_s: float) -> Floats:
-    """When sweeps (N,) began, in seconds after the first: by their stamps, or by their numbers, a revolution each."""
-    after: Floats = stamps_s - stamps_s[0]
-    if len(after) < 2 or is_clock(stamps_s):
-        return after
-    step = float(np.median(np.diff(after)))
-    return np.asarray((after if step <= MOST_SKIPPED else after / step) * (turn_s or NO_CLOCK_S))
+def _sense_along(frames: list[Frame], velocity: Floats, times: Floats, clouds: CloudOptions, look: Look) -> int:
+    """The sense of the times of points, by those `WARM_UP` sweeps in a row that skew moves farthest."""
+    skew_m = np.abs(velocity) @ np.repeat([look.reach_m, 1.0], 3)
+    first = int(np.argmax(np.convolve(skew_m, np.ones(min(WARM_UP, len(frames))), "valid")))
+    part = [retimed_frame(frame, look.revolution_s) for frame in frames[first : first + WARM_UP]]
+    sweeps = timed_sweeps(part, times[first:], clouds, look.reach_m)
+    voxel_m = max(look.reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
+    return sense_of_times(voxel_m, velocity[first], look.revolution_s > 0, sweeps)
 
 
 def register_steps(

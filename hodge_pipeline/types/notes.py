@@ -114,6 +114,8 @@ LOOKS = {
     "instant, and unless it was deskewed before (KITTI's are), turns bend the path",
     "times backwards": "the times of points seem to run backwards: taken so, more points lie on the map; they are "
     "taken so in {count} of {detail} sweeps",
+    "times unused": "the points of the sweeps have times, but more lie on the map where these are unused, as of sweeps "
+    "that were deskewed before: so they are in {count} of {detail} sweeps",
     "misfits": "{count} {count:frame fits|frames fit} nothing that the key frame saw ({detail}), and "
     "{count:follows|follow} its pose",
     "no truth near": "{detail}: no pose has a true one near in time: its error is not measured",
@@ -162,6 +164,8 @@ FACTS = {
     "readout": "the camera's read-out (rolling shutter), estimated: {detail}; readout_s in the camera's file would be "
     "exact",
     "truth": "{count} of {detail} frames {count:has|have} a true pose, by the truth that was named",
+    "times by order": "points of {count} of {detail} sweeps have no times (t, time, timestamp), but the order in which "
+    "a scanner measured them: their times are told by it",
     "revisits": "{count} {count:pair closes|pairs close} loops along the path, before the first round: odometry's "
     "poses move by up to {detail}",
     "positions of no frame": "{count} of {detail} known positions {count:is|are} of no frame, or another is nearer to "
