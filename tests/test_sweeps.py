@@ -31,16 +31,17 @@ from hodge_pipeline.registration.sweeps import (
     UNUSED,
     deskewed,
     deskewed_frame,
+    off_neighbours_m,
     turned,
     turns_by_order,
 )
 from hodge_pipeline.sources.frame_facts import frame_facts
 from hodge_pipeline.stages import Step, Steps, no_progress
-from hodge_pipeline.start.sweeps import Sweeps, deskewed_along, follow, key_rows
+from hodge_pipeline.start.sweeps import UNEVEN, Sweeps, deskewed_along, follow, key_rows
 from hodge_pipeline.types import Floats, Frame, Ints, PointCloud, Source
 from hodge_pipeline.types.notes import Note
 from hodge_pipeline.uses.trajectory import refine_trajectory
-from lidar_worlds import CarFree
+from lidar_worlds import CarFree, scanner_in
 
 Sweeping = Sequence[tuple[int, float, PointCloud]]
 COUNT, SPEED_M_S, UNIX_S = 24, 10.0, 1.7e9
@@ -129,9 +130,9 @@ def test_sweeps_after_unread_ones_are_followed() -> None:
 
 
 def test_a_sweep_that_cannot_be_aligned_tells_nothing_of_how_far_the_scanner_went() -> None:
-    clouds = [cast(Callable[[], PointCloud], frame.read_points)() for frame in street()[:3]]
-    clouds.insert(2, PointCloud(clouds[2].points_in_cam[:3]))
-    tracker, loose = ScanToMap(0.5, np.zeros(6)), []
+    clouds = [cast(Callable[[], PointCloud], frame.read_points)() for frame in street()[:4]]
+    clouds[2] = PointCloud(clouds[2].points_in_cam[:3])
+    tracker, loose = ScanToMap(0.5, np.array([0, 0, 0, SPEED_M_S, 0, 0])), []
     for number, cloud in enumerate(clouds):
         tracker.follow(cloud, number * REVOLUTION_S)
         loose.append(tracker.is_loose)
@@ -162,6 +163,42 @@ def test_sweeps_after_a_hole_are_followed(clock: str, is_timed: bool) -> None:
     rows = [number for number in range(COUNT) if not 12 <= number < 17]
     found, _ = followed([frames[row] for row in rows])
     assert absolute_error(found.world_from_scan, true_poses(rows)).max_m < NEAR_M
+
+
+@pytest.mark.parametrize("is_timed", [True, False])
+def test_after_a_hole_a_start_at_rest_counts_by_all_points_and_by_the_motion_so_far(is_timed: bool) -> None:
+    own = scanner_in("field", 2)  # whose rings fit each other wherever they are
+    exact = own.road.world_from_car((np.arange(20) + 0.5) * REVOLUTION_S)
+    tracker = ScanToMap(0.66, se3.log(se3.inverse(exact[8]) @ exact[9]) / REVOLUTION_S)
+    poses = []
+    for row in (8, 9, 10, 11, 16):
+        sweep = own.sweep(row)
+        tracker.follow(PointCloud(sweep.points, times_s=sweep.times_s if is_timed else None), row * REVOLUTION_S)
+        poses.append(tracker.pose)
+    moved, right = se3.inverse(poses[-2]) @ poses[-1], se3.inverse(exact[11]) @ exact[16]
+    assert np.linalg.norm((se3.inverse(right) @ moved)[:3, 3]) < 0.3  # at rest 1.8 and 2.4 m off
+
+
+def test_a_sweep_off_the_even_motion_around_it_is_named() -> None:
+    frames, side = street().copy(), np.array([0, 0.4, 0], np.float32)
+    frames[13] = changed(frames[13], lambda cloud: replace(cloud, points_in_cam=cloud.points_in_cam + side))
+    _, said = followed(frames)
+    assert "the path jumps at 1 sweep" in said and "(13.pcd: 0.3" in said
+    assert "jumps" not in followed(street())[1]
+
+
+def test_braking_is_even_motion_and_a_displaced_pose_is_not() -> None:
+    times = np.append(np.arange(20), np.arange(24, 40)) * REVOLUTION_S  # with a hole
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[:, 0, 3] = 20 * times - 2.5 * np.maximum(times - 0.8, 0) ** 2
+    poses[:, 1, 3] = 0.005 * (-1.0) ** np.arange(len(times))
+    off, usual = off_neighbours_m(poses, times)
+    assert (off < UNEVEN * usual + 1e-9)[1:-1].all()
+    poses[9, 1, 3] += 0.2
+    off, usual = off_neighbours_m(poses, times)
+    assert np.flatnonzero(off > UNEVEN * np.maximum(usual, 0.02)).tolist() == [9] and off[9] == pytest.approx(
+        0.2, abs=0.02
+    )
 
 
 @cache

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,7 +34,7 @@ went: 0 in a bare tunnel, 0.0013 on a bare field at 16 beams, 0.01 to 0.1 in off
 LEAST = 1e-6
 """Share of the information on translation that every direction keeps, so that the matrix stays positive."""
 UNMATCHED = 9.0
-"""Cost of a point without a correspondence, in mean squared errors of the others: as of one three times as far off."""
+"""Cost of a point without a correspondence, in usual errors of points with one: as of one three times as far off."""
 STRANGE, USUAL_OF, FEWEST_USUAL = 0.5, 10, 3
 """A sweep is strange that has half of the usual share of its points on the map: of the median of up to `USUAL_OF`
 sweeps before, at least `FEWEST_USUAL`. On a street with a tunnel it is 0.83 of that and more; of a mirrored sweep 0.42,
@@ -126,13 +127,14 @@ class ScanToMap:
             guesses = [before @ se3.exp(velocity * duration)]
             if _shift_m(velocity, far_m, abs(duration)) > self._coarsest_m:
                 guesses.append(before)  # after a gap the scanner may be where it was
-            pose, information = self._map.align(points, guesses)
+            moves_m2 = spread * duration**2
+            pose, information = self._map.align(points, guesses, partial(_surprise, predicted, moves_m2))
             is_loose = information is None and self._time_s is not None
             if information is None or not duration:  # no velocity from two sweeps of one stamp
                 break
             known = np.linalg.eigvalsh(information[3:, 3:])
             is_loose = bool(known[0] < LOOSE * known.sum())
-            pose, moved = _kalman_update(predicted, spread * duration**2, pose, information)
+            pose, moved = _kalman_update(predicted, moves_m2, pose, information)
             moved_spread = moved / duration**2
             velocity = se3.log(se3.inverse(before) @ pose) / duration
             rates.append(velocity)
@@ -152,11 +154,22 @@ def _shift_m(rates: Floats, far_m: float, seconds: float) -> float:
     return float((np.linalg.norm(rates[:3]) * far_m + np.linalg.norm(rates[3:])) * seconds)
 
 
+def _prior(spread_m2: Floats) -> Floats:
+    """The covariance (6, 6) of a predicted pose, by that (3, 3) of its translation; of rotation a sigma of 1 radian."""
+    covariance = np.eye(6)
+    covariance[3:, 3:] = spread_m2
+    return covariance
+
+
+def _surprise(predicted: Floats, spread_m2: Floats, aligned: Floats, information: Floats) -> float:
+    """Minus the log-likelihood of an aligned pose under the prediction, its own uncertainty counted in."""
+    off = se3.log(se3.inverse(predicted) @ aligned)
+    return float(off @ np.linalg.solve(_prior(spread_m2) + np.linalg.inv(information), off)) / 2
+
+
 def _kalman_update(predicted: Floats, spread_m2: Floats, aligned: Floats, information: Floats) -> tuple[Floats, Floats]:
     """The mean, by information, of the predicted and the aligned pose, and the covariance (3, 3) of its translation."""
-    known = np.eye(6)  # information of the prediction; of rotation: a sigma of 1 radian
-    known[3:, 3:] = np.linalg.inv(spread_m2)
-    both = information + known
+    both = information + np.linalg.inv(_prior(spread_m2))
     moved = np.asarray(np.linalg.solve(both, information @ se3.log(se3.inverse(predicted) @ aligned)))
     return predicted @ se3.exp(moved), np.asarray(np.linalg.inv(both)[3:, 3:])
 
@@ -250,13 +263,17 @@ class _Map:
     def __init__(self, voxel_m: float, levels: tuple[int, ...], sample_m: float) -> None:
         self._sample_m, self._is_empty, self._sweep, self._spurious = sample_m * voxel_m, True, None, 0.0
         self._share, self._shares = np.nan, deque[float](maxlen=USUAL_OF)  # of inliers: of the sweep, of those before
+        self._error, self._errors = np.nan, deque[float](maxlen=USUAL_OF)  # mean of inliers, likewise
         self._levels = [(size * voxel_m, small_gicp.GaussianVoxelMap(size * voxel_m)) for size in levels]
         for _, voxels in self._levels:
             voxels.set_lru(horizon=SWEEPS_KEPT)
 
-    def align(self, points: Floats, guesses: list[Floats]) -> tuple[Floats, Floats | None]:
+    def align(
+        self, points: Floats, guesses: list[Floats], surprise: Callable[[Floats, Floats], float]
+    ) -> tuple[Floats, Floats | None]:
         """The pose of a sweep by points (N, 3) and its information (6, 6), rotation first, in its own axes; the first
-        guess and None where it could not be aligned.
+        guess and None where it could not be aligned. `surprise` is minus the log-likelihood of a pose, with its
+        information, by what is known of the motion.
         """
         self._sweep, self._share = self._thinned(points) if len(points) >= MIN_POINTS else None, np.nan
         if self._sweep is None or self._sweep.size() < MIN_POINTS or self._is_empty:
@@ -268,11 +285,24 @@ class _Map:
         held = [one for one in found if one.num_inliers >= MIN_POINTS and se3.is_motion(one.T_target_source)]
         if not held:
             return guesses[0], None
-        usual = min(one.error / one.num_inliers for one in held)
-        best = min(held, key=lambda one: one.error + (count - one.num_inliers) * UNMATCHED * usual)
-        self._share = best.num_inliers / count
-        information = np.asarray(best.H) / (SHARED_ERRORS**2 * max(usual, 1e-12))
-        return np.asarray(best.T_target_source), _without_spurious(information, self._spurious)
+        least = max(min(one.error / one.num_inliers for one in held), 1e-12)
+        usual = _usual(self._errors) if len(self._errors) >= FEWEST_USUAL else least
+        placed = [
+            (np.asarray(one.T_target_source), self._information(one, max(least, usual)), one.num_inliers)
+            for one in held
+        ]
+        costs = [
+            (one.error / usual + (count - one.num_inliers) * UNMATCHED) / SHARED_ERRORS**2 + surprise(pose, information)
+            for one, (pose, information, _) in zip(held, placed, strict=True)
+        ]
+        best = int(np.argmin(costs))
+        pose, _, inliers = placed[best]
+        self._share, self._error = inliers / count, held[best].error / inliers
+        return pose, self._information(held[best], least)
+
+    def _information(self, aligned: Any, error: float) -> Floats:
+        """The information (6, 6) of an alignment whose points have this mean error."""
+        return _without_spurious(np.asarray(aligned.H) / (SHARED_ERRORS**2 * error), self._spurious)
 
     def share_at(self, pose: Floats) -> float:
         """The share of the points of the sweep aligned last that lie on the map, from this pose."""
@@ -305,6 +335,7 @@ class _Map:
             return
         if np.isfinite(self._share):
             self._shares.append(self._share)
+            self._errors.append(self._error)
         for _, voxels in self._levels:
             voxels.insert(self._sweep, pose)
         self._is_empty = False

@@ -16,6 +16,8 @@ STEPS_A_SWEEP = 64
 """Motions that a revolution is cut into: 1.6 cm each at 10 m/s and 10 revolutions a second."""
 FORWARDS, BACKWARDS, UNUSED = 1, -1, 0
 """Senses of the times of points: as told or by their order; the other way; sweeps were deskewed before."""
+USUAL_AROUND, FEWEST_STEADY = 10, 8
+"""Poses before and after one that tell how evenly a scanner moves there: a second; and poses that it takes to tell."""
 BLOCKS, FEWEST_IN_BLOCK = 128, 4
 """Blocks of points, in their order, that tell how a scanner spun: 3 degrees each, wider than the azimuths at which the
 lasers of one firing look apart."""
@@ -137,3 +139,22 @@ def turns_by_order(points: Floats32) -> Floats32 | None:
     at = np.append(seen[firsts + counts // 2], len(points) - 1)
     turns = np.append(turns, turns[-1] + np.median(steps) / 2)
     return np.asarray(np.interp(np.arange(len(points)), at, turns), np.float32)
+
+
+def off_neighbours_m(poses: Floats, times_s: Floats) -> tuple[Floats, Floats]:
+    """Metres (N,) by which each of N poses (N, 4, 4) is off the motion at constant velocity from the one before to the
+    one after, 0 at the ends; and what it is off for the usual changes of velocity around there, `USUAL_AROUND` poses to
+    each side.
+    """
+    off, usual = np.zeros(len(poses)), np.zeros(len(poses))
+    if len(poses) < FEWEST_STEADY:
+        return off, usual
+    before, after = np.diff(times_s)[:-1, None], np.diff(times_s)[1:, None]
+    moved = se3.log(se3.inverse(poses[:-2]) @ poses[2:]) * before / (before + after)
+    off[1:-1] = np.linalg.norm((se3.inverse(poses[:-2] @ se3.exp(moved)) @ poses[1:-1])[:, :3, 3], axis=1)
+    longer = np.maximum(1, before * after / np.median(np.diff(times_s)) ** 2).ravel()
+    change = off[1:-1] / longer
+    for row in range(len(change)):
+        around = np.delete(change[max(0, row - USUAL_AROUND) : row + USUAL_AROUND + 1], min(row, USUAL_AROUND))
+        usual[row + 1] = np.median(around) * longer[row]
+    return off, usual

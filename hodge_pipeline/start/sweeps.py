@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
+from scipy.ndimage import maximum_filter1d
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
@@ -26,6 +27,7 @@ from hodge_pipeline.registration.sweeps import (
     UNUSED,
     deskewed_frame,
     first_after_s,
+    off_neighbours_m,
     retimed_frame,
     velocities,
 )
@@ -65,6 +67,12 @@ WARM_UP = 20
 STRANGE = "it fits none of the sweeps around it, and these fit each other: is it of another place?"
 MOST_LOOSE = 0.5
 """Share of sweeps that tell little of how far the scanner went, above which the whole path is in doubt."""
+UNEVEN_VOXELS, UNEVEN = 0.2, 5.0
+"""A sweep is unevenly placed that lies farther off the motion from the one before to the one after than this share of
+a voxel, and than as many times what is usual around there: in 24 simulated sequences that are right to a few
+centimetres one lies off by 0.12 voxels, the others by 0.07 and less."""
+TOLD = 5
+"""Unevenly placed sweeps that are named."""
 STEPS_AROUND = 5
 """Steps before and after a sweep for its median velocity: half a second, in which a car hardly changes its speed."""
 
@@ -157,6 +165,9 @@ def follow(
     if loose.any():
         kind = "path loose" if loose.sum() > MOST_LOOSE * found.sum() else "sweeps loose"
         step.note(Note(kind, int(loose.sum()), str(count)))
+    jumps = [one for part in parts for one in part.jumps]
+    if jumps:
+        step.note(Note("sweeps uneven", len(jumps), ", ".join(jumps[:TOLD]) + ", …" * (len(jumps) > TOLD)))
     clocked = [rows for rows in sequences if is_clock(stamps[rows])]
     step.note(*told_gaps(clocked, stamps, vertex_ids(source)))
     step.note(*_notes_of_times(revolution_s, sense))
@@ -178,7 +189,7 @@ def _notes_of_times(revolution_s: Floats, sense: Ints) -> list[Note]:
 class _Followed(NamedTuple):
     """One sequence: poses (M, 4, 4) at the stamps, velocities (M, 6), which (M,) sweeps were read, where (M,) the
     alignment was loose; whether points have times; how these are read (`retimed_frame`); the reach of the scanner in
-    metres; what is odd.
+    metres; what is odd; sweeps off the even motion around them.
     """
 
     world_from_scan: Floats
@@ -190,6 +201,7 @@ class _Followed(NamedTuple):
     sense: int
     reach_m: float
     odd: list[Oddity]
+    jumps: list[str]
 
 
 def _follow_one(
@@ -198,6 +210,7 @@ def _follow_one(
     count, is_timed, rows, odd = len(frames), False, list[int](), list[Oddity]()
     poses, velocity, middle_s = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6)), np.zeros(count)
     found, loose, original = np.zeros(count, bool), np.zeros(count, bool), np.arange(count)
+    jumps = list[str]()
     look = first_look(frames, stamps_s, clouds)
     usual_m, revolution_s = look.reach_m, look.revolution_s
     times = begun_s(stamps_s, look.turn_s)
@@ -237,8 +250,14 @@ def _follow_one(
         found = found[original]
         last = np.maximum(np.searchsorted(rows, np.arange(count), side="right") - 1, 0)
         velocity = velocities(poses[rows], times[rows])[last]
+        off_m, usual_off_m = off_neighbours_m(poses[rows], times[rows])
+        uneven = off_m > np.maximum(UNEVEN_VOXELS * voxel, UNEVEN * usual_off_m)
+        uneven &= off_m >= maximum_filter1d(off_m, 3)  # a displaced pose puts those beside it off by half
+        jumps = [
+            f"{frames[row].frame_id}: {m:.2f} m" for row, m in zip(np.array(rows)[uneven], off_m[uneven], strict=True)
+        ]
         poses = poses[rows][last] @ se3.exp(-middle_s[rows][last][:, None] * velocity)  # to the stamp
-    return _Followed(poses, velocity, found, loose, is_timed, revolution_s, sense, usual_m, odd)
+    return _Followed(poses, velocity, found, loose, is_timed, revolution_s, sense, usual_m, odd, jumps)
 
 
 def deskewed_along(source: Source, world_from_scan: Floats, clouds: CloudOptions, steps: Steps) -> Source:

@@ -110,6 +110,9 @@ LOOKS = {
     "the first: {detail}",
     "sweeps loose": "{count} of {detail} sweeps {count:tells|tell} little of how far the scanner went, as in a "
     "tunnel, and it goes on as before",
+    "sweeps uneven": "the path jumps at {count} {count:sweep|sweeps}, farther off the motion of the sweeps around "
+    "{count:it|them} than these are ({detail}): its steps there may be off by as much, as where objects move or points "
+    "have no times",
     "sweeps untimed": "the points of the sweeps have no times (t, time, timestamp): each is taken as measured in an "
     "instant, and unless it was deskewed before (KITTI's are), turns bend the path",
     "times backwards": "the times of points seem to run backwards: taken so, more points lie on the map; they are "
