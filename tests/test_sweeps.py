@@ -246,6 +246,18 @@ def test_sweeps_of_given_poses_are_deskewed_by_them() -> None:
     assert after < 0.75 * before  # skewed around a corner, they fit each other where the scanner was not
 
 
+def test_backward_times_of_sweeps_with_given_poses_are_turned_and_named() -> None:
+    notes = list[Note]()
+    steps = cast(Steps, SimpleNamespace(note=notes.append))
+    source = Source("sweeps", Path("sweeps"), tuple(changed(frame, turned) for frame in street()))
+    made = deskewed_along(source, true_poses(range(COUNT)), CloudOptions(max_range_m=FARTHEST_M), steps)
+    assert [note.kind for note in notes] == ["times backwards"]
+    got, own = made.frames[12].read_points, street()[12].read_points
+    assert got is not None and own is not None
+    right = deskewed(own(), np.array([0, 0, 0, SPEED_M_S, 0, 0])).points_in_cam
+    assert np.abs(got().points_in_cam - right).max() < 0.2 < np.abs(own().points_in_cam - right).max()
+
+
 @pytest.mark.parametrize(("apart_s", "told"), [(0.1, ["sweeps untimed"]), (30.0, [])])
 def test_given_poses_of_sweeps_without_times_are_told_and_those_of_stations_are_not(
     apart_s: float, told: list[str]
