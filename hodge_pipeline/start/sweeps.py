@@ -150,7 +150,13 @@ def follow(
     found, loose, parts = np.zeros(count, bool), np.zeros(count, bool), list[_Followed]()
     revolution_s, sense = np.zeros(count), np.ones(count, np.int64)
     for rows in sequences:
-        part = _follow_one([source.frames[row] for row in rows], stamps[rows], clouds, voxel_m, step.advance)
+        frames = [source.frames[row] for row in rows]
+        part = _follow_one(frames, stamps[rows], clouds, voxel_m, step.advance)
+        if part.revolution_s and part.sense == FORWARDS:  # the first sweeps, perhaps at rest, tell less than fast ones
+            look = first_look(frames, stamps[rows], clouds)
+            times = begun_s(stamps[rows], look.turn_s)
+            if _sense_along(frames, part.velocity, times, clouds, look) != FORWARDS:
+                part = _follow_one(frames, stamps[rows], clouds, voxel_m, lambda _: None, by_order=False)
         poses[rows], velocity[rows] = part.world_from_scan, part.velocity
         found[rows], loose[rows] = part.found, part.loose
         revolution_s[rows], sense[rows] = part.revolution_s, part.sense
@@ -205,13 +211,20 @@ class _Followed(NamedTuple):
 
 
 def _follow_one(
-    frames: Sequence[Frame], stamps_s: Floats, clouds: CloudOptions, voxel_m: float | None, advance: Advance
+    frames: Sequence[Frame],
+    stamps_s: Floats,
+    clouds: CloudOptions,
+    voxel_m: float | None,
+    advance: Advance,
+    by_order: bool = True,
 ) -> _Followed:
     count, is_timed, rows, odd = len(frames), False, list[int](), list[Oddity]()
     poses, velocity, middle_s = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6)), np.zeros(count)
     found, loose, original = np.zeros(count, bool), np.zeros(count, bool), np.arange(count)
     jumps = list[str]()
     look = first_look(frames, stamps_s, clouds)
+    if look.revolution_s and not by_order:
+        look = Look(look.reach_m, 0.0, 0.0)
     usual_m, revolution_s = look.reach_m, look.revolution_s
     times = begun_s(stamps_s, look.turn_s)
     voxel = voxel_m or max(usual_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
