@@ -55,9 +55,9 @@ simulated corridor steps of 16 beams scattered by 0.1 m and claimed 3 mm.
 MOST_PASSES = 4
 """Passes over the first sweeps, forwards and backwards, for their velocity, at most."""
 SURE, FEWEST_TIMED = 4.0, 10
-"""Standard errors by which more points lie on the map where times run backwards, or are unused, over as many of the
-first sweeps and more, before they are taken so: of 63 simulated sequences with right times none
-reaches it, of the same turned 28.
+"""Standard errors by which more points lie on the map by other times than those told, over as many sweeps and more,
+before these are taken. Times by the order of points reach 9.5 in 28 simulated sequences as measured, 0.2 in the same
+deskewed before.
 """
 MOST_DESKEWS, FARTHER = 3, 0.9
 """A sweep is deskewed again while its new velocity moves its farther points, at this quantile, by half a voxel."""
@@ -221,26 +221,23 @@ def first_velocity(voxel_m: float, sweeps: Sequence[tuple[int, float, PointCloud
     return ends[(len(ends) - 1) // 2 * 2], strange
 
 
-def sense_of_times(
-    voxel_m: float, velocity: Floats, by_order: bool, sweeps: Sequence[tuple[int, float, PointCloud]]
-) -> int:
-    """The sense of the times of points in these sweeps, which began with this velocity: `FORWARDS`, unless clearly more
-    points lie on the map where times are turned or unused: right times put points where they were, wrong ones blur it.
-
-    Times by the order of points are unused where the sweeps are too few to tell: they may be single scans at rest.
+def sense_of_times(voxel_m: float, velocity: Floats, told: int, sweeps: Sequence[tuple[int, float, PointCloud]]) -> int:
+    """The sense of the times of points in these sweeps, which began with this velocity: `told`, unless surely more
+    points lie on the map by another: right times put points where they were, wrong ones blur it.
     """
-    if all(cloud.times_s is None for _, _, cloud in sweeps):
-        return FORWARDS
     if len(sweeps) < FEWEST_TIMED:
-        return UNUSED if by_order else FORWARDS
-    told, best, sense = _shares(voxel_m, velocity, sweeps), 0.0, FORWARDS
-    for other in (BACKWARDS, UNUSED):
-        changed = [(row, at, retimed(cloud, 0.0, other)) for row, at, cloud in sweeps]
-        gain = _shares(voxel_m, velocity, changed) - told
-        mean = float(np.nanmean(gain))
-        if mean > max(best, SURE * np.nanstd(gain, ddof=1) / np.sqrt(len(gain))):
-            best, sense = mean, other
-    return sense
+        return told
+
+    def on_map(sense: int) -> Floats:
+        return _shares(voxel_m, velocity, [(row, at, retimed(cloud, 0.0, sense)) for row, at, cloud in sweeps])
+
+    nearest = UNUSED if told == FORWARDS else FORWARDS
+    shares = {told: on_map(told), nearest: on_map(nearest)}
+    if np.nanmean(shares[nearest] - shares[told]) > 0:  # else what skews points the other way fits less still
+        shares[BACKWARDS] = on_map(BACKWARDS)
+    best = max(shares, key=lambda sense: float(np.nanmean(shares[sense])))
+    gain = shares[best] - shares[told]
+    return best if np.nanmean(gain) > SURE * np.nanstd(gain, ddof=1) / np.sqrt(len(gain)) else told
 
 
 def _shares(voxel_m: float, velocity: Floats, sweeps: Sequence[tuple[int, float, PointCloud]]) -> Floats:

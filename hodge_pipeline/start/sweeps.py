@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 from scipy.ndimage import maximum_filter1d
@@ -48,6 +49,7 @@ from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
 from hodge_pipeline.start.sweep_reading import (
     LEFT_OUT,
     NO_CLOCK_S,
+    REVOLUTION_S,
     Look,
     begun_s,
     first_look,
@@ -67,12 +69,15 @@ WARM_UP = 20
 STRANGE = "it fits none of the sweeps around it, and these fit each other: is it of another place?"
 MOST_LOOSE = 0.5
 """Share of sweeps that tell little of how far the scanner went, above which the whole path is in doubt."""
-UNEVEN_VOXELS, UNEVEN = 0.2, 5.0
+UNEVEN_VOXELS, UNEVEN, GRIP_M_S2 = 0.2, 5.0, 9.81
 """A sweep is unevenly placed that lies farther off the motion from the one before to the one after than this share of
-a voxel, and than as many times what is usual around there: in 24 simulated sequences that are right to a few
-centimetres one lies off by 0.12 voxels, the others by 0.07 and less."""
+a voxel (alignments of 24 simulated sequences scatter by up to 0.12), than as many times what is usual around there, and
+than an acceleration of 1 g moves it, more than tyres hold. Turns are not judged: one that sets in on the spot, at 90
+degrees a second, is as far off as a false one of 4 degrees."""
 TOLD = 5
 """Unevenly placed sweeps that are named."""
+AS_TOLD = 0.0, FORWARDS
+"""How the times of points are read (`retimed_frame`) where nothing is sure to be better."""
 STEPS_AROUND = 5
 """Steps before and after a sweep for its median velocity: half a second, in which a car hardly changes its speed."""
 
@@ -150,13 +155,7 @@ def follow(
     found, loose, parts = np.zeros(count, bool), np.zeros(count, bool), list[_Followed]()
     revolution_s, sense = np.zeros(count), np.ones(count, np.int64)
     for rows in sequences:
-        frames = [source.frames[row] for row in rows]
-        part = _follow_one(frames, stamps[rows], clouds, voxel_m, step.advance)
-        if part.revolution_s and part.sense == FORWARDS:  # the first sweeps, perhaps at rest, tell less than fast ones
-            look = first_look(frames, stamps[rows], clouds)
-            times = begun_s(stamps[rows], look.turn_s)
-            if _sense_along(frames, part.velocity, times, clouds, look) != FORWARDS:
-                part = _follow_one(frames, stamps[rows], clouds, voxel_m, lambda _: None, by_order=False)
+        part = _follow_one([source.frames[row] for row in rows], stamps[rows], clouds, voxel_m, step.advance)
         poses[rows], velocity[rows] = part.world_from_scan, part.velocity
         found[rows], loose[rows] = part.found, part.loose
         revolution_s[rows], sense[rows] = part.revolution_s, part.sense
@@ -185,9 +184,9 @@ def follow(
 def _notes_of_times(revolution_s: Floats, sense: Ints) -> list[Note]:
     """How many sweeps have times of points other than those told, by `retimed_frame`."""
     counts = {
-        "times by order": (revolution_s > 0) & (sense != UNUSED),
+        "times by order": revolution_s > 0,
         "times backwards": sense == BACKWARDS,
-        "times unused": (revolution_s == 0) & (sense == UNUSED),
+        "times unused": sense == UNUSED,
     }
     return [Note(kind, int(where.sum()), str(len(sense))) for kind, where in counts.items() if where.any()]
 
@@ -211,32 +210,34 @@ class _Followed(NamedTuple):
 
 
 def _follow_one(
-    frames: Sequence[Frame],
-    stamps_s: Floats,
-    clouds: CloudOptions,
-    voxel_m: float | None,
-    advance: Advance,
-    by_order: bool = True,
+    frames: list[Frame], stamps_s: Floats, clouds: CloudOptions, voxel_m: float | None, advance: Advance
+) -> _Followed:
+    """One sequence, its points timed as told; followed again where its fastest sweeps are sure of other times."""
+    look = first_look(frames, stamps_s, clouds)
+    voxel = voxel_m or max(look.reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
+    times = begun_s(stamps_s, 0.0 if look.revolution_s else look.turn_s)
+    part = _follow_as_told(frames, times, clouds, voxel, look.reach_m, advance)
+    read = np.flatnonzero(part.found)
+    turning = begun_s(stamps_s, look.turn_s)
+    velocity = part.velocity[read] * (times[-1] / turning[-1] if turning[-1] else 1.0)
+    told = _times_along([frames[row] for row in read], velocity, turning[read], clouds, voxel, look)
+    if told == AS_TOLD:
+        return part
+    times = turning if told[1] != UNUSED else begun_s(stamps_s, 0.0)
+    again = [retimed_frame(frame, *told) for frame in frames]
+    part = _follow_as_told(again, times, clouds, voxel, look.reach_m, lambda _: None)
+    return part._replace(revolution_s=told[0], sense=told[1])
+
+
+def _follow_as_told(
+    frames: list[Frame], times: Floats, clouds: CloudOptions, voxel_m: float, usual_m: float, advance: Advance
 ) -> _Followed:
     count, is_timed, rows, odd = len(frames), False, list[int](), list[Oddity]()
     poses, velocity, middle_s = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6)), np.zeros(count)
     found, loose, original = np.zeros(count, bool), np.zeros(count, bool), np.arange(count)
     jumps = list[str]()
-    look = first_look(frames, stamps_s, clouds)
-    if look.revolution_s and not by_order:
-        look = Look(look.reach_m, 0.0, 0.0)
-    usual_m, revolution_s = look.reach_m, look.revolution_s
-    times = begun_s(stamps_s, look.turn_s)
-    voxel = voxel_m or max(usual_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
-    warm_up = timed_sweeps([retimed_frame(f, revolution_s) for f in frames[:WARM_UP]], times, clouds, usual_m)
-    begun, strange = first_velocity(voxel, warm_up)
-    known = [one for one in warm_up if one[0] not in strange]
-    sense = sense_of_times(voxel, begun, revolution_s > 0, known)
-    frames = [retimed_frame(frame, revolution_s, sense) for frame in frames]
-    if sense != FORWARDS:
-        times = begun_s(stamps_s, look.turn_s if sense or not revolution_s else 0.0)
-        begun, strange = first_velocity(voxel, timed_sweeps(frames[:WARM_UP], times, clouds, usual_m))
-    tracker = ScanToMap(voxel, begun)
+    begun, strange = first_velocity(voxel_m, timed_sweeps(frames[:WARM_UP], times, clouds, usual_m))
+    tracker = ScanToMap(voxel_m, begun)
 
     def read() -> Iterator[tuple[int, float, PointCloud]]:
         latest = 0
@@ -263,14 +264,21 @@ def _follow_one(
         found = found[original]
         last = np.maximum(np.searchsorted(rows, np.arange(count), side="right") - 1, 0)
         velocity = velocities(poses[rows], times[rows])[last]
-        off_m, usual_off_m = off_neighbours_m(poses[rows], times[rows])
-        uneven = off_m > np.maximum(UNEVEN_VOXELS * voxel, UNEVEN * usual_off_m)
-        uneven &= off_m >= maximum_filter1d(off_m, 3)  # a displaced pose puts those beside it off by half
-        jumps = [
-            f"{frames[row].frame_id}: {m:.2f} m" for row, m in zip(np.array(rows)[uneven], off_m[uneven], strict=True)
-        ]
+        is_numbered = not is_timed and not is_clock(np.array([frame.stamp_s for frame in frames]))
+        seconds = times[rows] * (REVOLUTION_S / NO_CLOCK_S if is_numbered else 1.0)
+        jumps = _jumps([str(frames[row].frame_id) for row in rows], poses[rows], seconds, voxel_m)
         poses = poses[rows][last] @ se3.exp(-middle_s[rows][last][:, None] * velocity)  # to the stamp
-    return _Followed(poses, velocity, found, loose, is_timed, revolution_s, sense, usual_m, odd, jumps)
+    return _Followed(poses, velocity, found, loose, is_timed, *AS_TOLD, usual_m, odd, jumps)
+
+
+def _jumps(names: list[str], poses: Floats, times_s: Floats, voxel_m: float) -> list[str]:
+    """Names of the sweeps that lie off the even motion around them, and how far."""
+    off_m, usual_m = off_neighbours_m(poses, times_s)
+    around = np.diff(times_s, prepend=np.nan) * np.diff(times_s, append=np.nan)
+    uneven = off_m > np.maximum(UNEVEN_VOXELS * voxel_m, UNEVEN * usual_m)
+    uneven &= off_m > GRIP_M_S2 / 2 * around  # never at the ends
+    uneven &= off_m >= maximum_filter1d(off_m, 3)  # a displaced pose puts those beside it off by half
+    return [f"{names[row]}: {off_m[row]:.2f} m" for row in np.flatnonzero(uneven)]
 
 
 def deskewed_along(source: Source, world_from_scan: Floats, clouds: CloudOptions, steps: Steps) -> Source:
@@ -294,9 +302,10 @@ def deskewed_along(source: Source, world_from_scan: Floats, clouds: CloudOptions
             velocity[rows] = [
                 np.median(rates[max(0, row - STEPS_AROUND) : row + STEPS_AROUND], axis=0) for row in range(len(rows))
             ]
-            revolution_s[rows] = look.revolution_s
-            sense[rows] = _sense_along(frames, velocity[rows], times, clouds, look)
-        is_untimed |= bool(turns and not (look.turn_s and sense[rows[0]]))
+            voxel_m = max(look.reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
+            revolution_s[rows], sense[rows] = _times_along(frames, velocity[rows], times, clouds, voxel_m, look)
+        in_use = revolution_s[rows[0]] > 0 if look.revolution_s else look.turn_s > 0 and sense[rows[0]] != UNUSED
+        is_untimed |= bool(turns and not in_use)
     for note in _notes_of_times(revolution_s, sense) + [Note("sweeps untimed")] * is_untimed:
         steps.note(note)
     if not velocity.any():
@@ -305,14 +314,24 @@ def deskewed_along(source: Source, world_from_scan: Floats, clouds: CloudOptions
     return replace(source, frames=tuple(map(deskewed_frame, timed, velocity)))
 
 
-def _sense_along(frames: list[Frame], velocity: Floats, times: Floats, clouds: CloudOptions, look: Look) -> int:
-    """The sense of the times of points, by those `WARM_UP` sweeps in a row that skew moves farthest."""
+def _times_along(
+    frames: list[Frame], velocity: Floats, times: Floats, clouds: CloudOptions, voxel_m: float, look: Look
+) -> tuple[float, int]:
+    """How the times of points are read (`retimed_frame`), by those `WARM_UP` sweeps in a row that skew moves farthest.
+
+    Times by the order of points, and others than those told, are taken only where the map is sure of them: sweeps may
+    have been deskewed before.
+    """
+    if not look.turn_s or not len(frames):
+        return AS_TOLD
     skew_m = np.abs(velocity) @ np.repeat([look.reach_m, 1.0], 3)
-    first = int(np.argmax(np.convolve(skew_m, np.ones(min(WARM_UP, len(frames))), "valid")))
+    in_a_row = sliding_window_view(skew_m, min(WARM_UP, len(frames)))
+    first = int(np.argmax(np.median(in_a_row, axis=1)))
     part = [retimed_frame(frame, look.revolution_s) for frame in frames[first : first + WARM_UP]]
     sweeps = timed_sweeps(part, times[first:], clouds, look.reach_m)
-    voxel_m = max(look.reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
-    return sense_of_times(voxel_m, velocity[first], look.revolution_s > 0, sweeps)
+    told = UNUSED if look.revolution_s else FORWARDS
+    sense = sense_of_times(voxel_m, velocity[first], told, sweeps)
+    return AS_TOLD if sense == told else (look.revolution_s, sense)
 
 
 def register_steps(
