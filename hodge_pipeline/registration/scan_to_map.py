@@ -169,7 +169,9 @@ def _surprise(predicted: Floats, spread_m2: Floats, aligned: Floats, information
 
 def _kalman_update(predicted: Floats, spread_m2: Floats, aligned: Floats, information: Floats) -> tuple[Floats, Floats]:
     """The mean, by information, of the predicted and the aligned pose, and the covariance (3, 3) of its translation."""
-    both = information + np.linalg.inv(_prior(spread_m2))
+    known = np.eye(6)  # information of the prediction
+    known[3:, 3:] = np.linalg.inv(spread_m2)
+    both = information + known
     moved = np.asarray(np.linalg.solve(both, information @ se3.log(se3.inverse(predicted) @ aligned)))
     return predicted @ se3.exp(moved), np.asarray(np.linalg.inv(both)[3:, 3:])
 
@@ -270,7 +272,7 @@ class _Map:
     ) -> tuple[Floats, Floats | None]:
         """The pose of a sweep by points (N, 3) and its information (6, 6), rotation first, in its own axes; the first
         guess and None where it could not be aligned. `surprise` is minus the log-likelihood of a pose, with its
-        information, by what is known of the motion.
+        information, by what is known of the motion; it counts where there are several guesses.
         """
         self._sweep, self._share = self._thinned(points) if len(points) >= MIN_POINTS else None, np.nan
         if self._sweep is None or self._sweep.size() < MIN_POINTS or self._is_empty:
@@ -283,13 +285,15 @@ class _Map:
         if not held:
             return guesses[0], None
         least = max(min(one.error / one.num_inliers for one in held), 1e-12)
-        usual = _usual(self._errors) if len(self._errors) >= FEWEST_USUAL else least
+        is_after_hole = len(guesses) > 1
+        usual = _usual(self._errors) if is_after_hole and len(self._errors) >= FEWEST_USUAL else least
         placed = [
             (np.asarray(one.T_target_source), self._information(one, max(least, usual)), one.num_inliers)
             for one in held
         ]
         costs = [
-            (one.error / usual + (count - one.num_inliers) * UNMATCHED) / SHARED_ERRORS**2 + surprise(pose, information)
+            (one.error / usual + (count - one.num_inliers) * UNMATCHED) / SHARED_ERRORS**2
+            + (surprise(pose, information) if is_after_hole else 0.0)
             for one, (pose, information, _) in zip(held, placed, strict=True)
         ]
         best = int(np.argmin(costs))
