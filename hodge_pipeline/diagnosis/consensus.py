@@ -1,9 +1,9 @@
 """The solution that most edges agree with, and the probability that each edge is right, given that solution.
 
-Greedy merging can mistake a place for another that looks like it, and no single move then leads back. Where every pair
-was tried, a second start begins with the paths of consecutive views, which are wrong more rarely: the local search
+Greedy merging can mistake a place for another that looks like it, and no single move then leads back. So a second start
+begins with the paths of consecutive views, which are wrong more rarely. Where every pair was tried, the local search
 begins at both, the pieces that result are merged on, and the solution with the larger log-evidence is taken. Elsewhere
-it begins with chordal poses of all edges, from which edges beyond the gate are dropped.
+a third start begins with chordal poses of all edges, from which edges beyond the gate are dropped.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ def _mended(evidence: Evidence, grown: Alignment) -> Solved:
         return best
     if not best.used.all():
         whole = Alignment(connected_components(graph.edges, graph.vertex_count), best.poses)
-        other = fit(evidence, fit(evidence, whole, (EVERY,), "chordal"), ANNEALED)
-        best = min(best, fit(evidence, other, (GATE,)), key=_misfit)
+        for start in (_in_order(evidence), fit(evidence, whole, (EVERY,), "chordal")):
+            best = min(best, fit(evidence, fit(evidence, start, ANNEALED), (GATE,)), key=_misfit)
     return searched(evidence, best)
 
 
