@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,23 @@ def test_the_unit_of_length_does_not_matter(clouds: CloudSet, registered: Edges)
     motions[:, :3, 3] *= 100
     found = seen_through(registered.put(slice(None), i_from_j=motions), large, [CAMERA] * 3, scale=100.0)
     np.testing.assert_allclose(found, seen_through(registered, clouds, [CAMERA] * 3), atol=1e-6)
+
+
+def test_of_each_cloud_its_view_and_a_thousand_points_are_kept() -> None:
+    count = 30
+    wall = np.random.default_rng(0).uniform(-1, 1, (20000, 3)).astype(np.float32) * [1.0, 1.0, 0.0] + [0, 0, 2]
+    large = CloudSet.from_clouds([PointCloud(wall.astype(np.float32))] * count)
+    pairs = Edges.of([(row, row + 1) for row in range(count - 1)])
+    pairs = pairs.with_registrations([Registration(np.eye(4), np.eye(6), 0.7, 0.01, 900, 5, True)] * len(pairs))
+    tracemalloc.start()
+    try:
+        seen_through(pairs, large, [CAMERA] * count)
+        peak_bytes = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert (
+        peak_bytes < 50_000 * count + 3_000_000
+    )  # of which one cloud at work takes 2 MB; whole clouds would take 14 MB
 
 
 def test_a_step_that_a_round_slides_keeps_the_measurement_of_odometry(clouds: CloudSet, registered: Edges) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from hodge_pipeline.registration.global_evidence import DepthView, cloud_view, violation
 from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame
+from hodge_pipeline.types.arrays import evenly
 
 POINTS_PROJECTED = 1000
 """Of a cloud, at most: the standard error of a share of 0.15 is 1 %."""
@@ -33,7 +34,7 @@ def seen_through(registered: Edges, clouds: CloudSet, cameras: Sequence[Camera |
     @lru_cache(maxsize=VIEWS_KEPT)
     def seen(row: int, camera: Camera) -> tuple[DepthView, Floats]:
         points = np.asarray(clouds[row].points_in_cam, float)
-        return cloud_view(points, camera, scale), points[:: max(1, len(points) // POINTS_PROJECTED)]
+        return cloud_view(points, camera, scale), points[evenly(len(points), POINTS_PROJECTED)]
 
     out = np.full(len(registered), np.nan)
     for at, ((i, j), motion) in enumerate(zip(registered.pairs.tolist(), registered.i_from_j, strict=True)):
