@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import tracemalloc
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from hodge_pipeline import se3
 from hodge_pipeline.executors.local import LocalExecutor
+from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.refine.model_edges import depth_edges
 from hodge_pipeline.registration.acceptance import SEEN_THROUGH, Acceptance, accepted, with_odometry
 from hodge_pipeline.registration.assessment import MOST_VIOLATION
 from hodge_pipeline.registration.odometry import OdometryOptions, odometry
 from hodge_pipeline.registration.seen_through import seen_through
-from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, PointCloud, Registration
+from hodge_pipeline.review.adding import Candidate, assessed
+from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, PointCloud, Registration, ViewGraph
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 PAIRS = [[0, 1], [0, 2], [1, 2]]
@@ -96,3 +101,39 @@ def test_odometry_is_lost_at_a_step_that_free_space_refutes(
     assert found.steps.pairs.tolist() == ([[0, 1]] if limit else [[0, 1], [1, 2]])
     assert len(found.notes) == (limit is not None)
     assert all("rows 1 and 2 (surfaces fit" in note for note in found.notes)
+
+
+def _frames() -> list[Frame]:
+    return [
+        Frame(row, float(row), CAMERA, read_depth=lambda: np.zeros((480, 640), np.float32), world_from_cam=np.eye(4))
+        for row in range(3)
+    ]
+
+
+def test_review_says_of_a_pair_added_by_hand_what_the_solve_will(clouds: CloudSet) -> None:
+    recipe, slid = load_recipe("seven_scenes"), se3.exp(np.array([0, 0, 0, SLID[1], 0, 0]))
+    graph = ViewGraph.from_edges(np.arange(3), np.zeros((0, 2), np.int64), np.zeros((0, 4, 4)))
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    for motion, frames, why in ((slid, _frames(), SEEN_THROUGH), (np.eye(4), _frames(), ""), (slid, (), "")):
+        found = Registration(motion, np.eye(6), 0.7, 0.01, 900, 5, True)
+        wanted = Candidate(0, 2, motion)
+        assert assessed(recipe, graph, clouds, frames, poses, wanted, found).rejected == why
+
+
+def test_depth_beside_a_model_is_tested_by_free_space_too(clouds: CloudSet, registered: Edges) -> None:
+    results = iter([(clouds, ()), registered])
+    steps: Any = SimpleNamespace(step=lambda *_, **__: next(results), remember=lambda *_: None, key=lambda _: "")
+    names = tuple("abc")
+    model: Any = SimpleNamespace(
+        frames=_frames(), body_of_frame=np.arange(3), body_from_cam=np.tile(np.eye(4), (3, 1, 1)), body_names=names
+    )
+    options: Any = SimpleNamespace(
+        edges=SimpleNamespace(propose=lambda *_: Edges.of(PAIRS)),
+        clouds=None,
+        registration=None,
+        seed=0,
+        acceptance=Acceptance(min_spread=0.0),
+    )
+    found = depth_edges(model, options, steps, SimpleNamespace())
+    assert found.graph.edges.tolist() == [PAIRS[0], PAIRS[2]]
+    assert found.notes == (f"1 pair with depth left out: {SEEN_THROUGH}",)

@@ -314,7 +314,8 @@ class Session:
         with self.changed:
             if self.candidate is wanted:
                 poses = self.settled.world_from_cam
-                self.candidate = assessed(recipe, self.table.graph, poses, wanted, found)
+                graph, frames = self.table.graph, self.subject.frames
+                self.candidate = assessed(recipe, graph, clouds, frames, poses, wanted, found)
             self.bump()
 
     def refresh(self) -> None:
