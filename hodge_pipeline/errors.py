@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from errno import EDQUOT, ENOSPC
+from errno import EDQUOT, EILSEQ, ENODATA, ENOSPC
 from pathlib import Path
 
 
@@ -55,6 +55,13 @@ class CheckError(HodgeError):
     """A result failed its own checks. `exit_code` is 3."""
 
     exit_code = 3
+
+
+def not_read(path: Path, error: OSError) -> SourceError:
+    """What an input file that cannot be read is told as."""
+    if error.errno in (ENODATA, EILSEQ):  # of `types.input_files`: these words say what to do
+        return SourceError(f"{path}: {error.strerror}")
+    return SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions")
 
 
 def not_written(path: Path, error: OSError) -> WorkspaceError:

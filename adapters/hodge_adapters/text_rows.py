@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from hodge_pipeline.errors import SourceError, not_written
+from hodge_pipeline.errors import SourceError, not_read, not_written
 from hodge_pipeline.types.input_files import beginning, read_input_text
 from hodge_pipeline.types.output_files import replacing
 
@@ -36,7 +36,7 @@ def reading(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions") from error
+        raise not_read(path, error) from error
 
 
 def names_in(folder: Path) -> list[str]:

@@ -13,7 +13,8 @@ MAX_WHOLE_BYTES = 1 << 31
 """The longest file that is read whole: 2 GiB of text are 20 million edges, or a model of 10,000 images."""
 _LFS_HEAD, _LFS_BYTES = b"version https://git-lfs", 1024
 """How a pointer of Git LFS, in the place of the file itself, begins, and a length that it stays below."""
-_COMPRESSED = {b"\x1f\x8b\x08": "gzip", b"\x28\xb5\x2f\xfd": "zstd", b"\xfd7zXZ\0": "xz", b"BZh91AY&SY": "bzip2"}
+_COMPRESSED = {b"\x1f\x8b\x08": "gzip", b"\x28\xb5\x2f\xfd": "zstd", b"\xfd7zXZ\0": "xz"}
+_COMPRESSED |= {b"BZh%d1AY&SY" % level: "bzip2" for level in range(1, 10)}
 """How what a compressor writes begins; no format that is read begins so, whatever the file is called."""
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _KINDS = {

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.errors import SourceError
+from hodge_pipeline.errors import SourceError, not_read
 from hodge_pipeline.types import Model
 from hodge_pipeline.types.input_files import open_input
 
@@ -144,7 +144,7 @@ def read_model(path: Path) -> Model:
                 _check_length(path, file, file.tell(), header.triangles * FACE.itemsize, header.triangles, "triangles")
                 faces = np.fromfile(file, FACE, header.triangles)
     except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror}): restore the file or its permissions") from error
+        raise not_read(path, error) from error
     told = [comment.partition(" ") for comment in header.comments]
     names = {name for name, _ in header.properties}
     return Model(
