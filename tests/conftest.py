@@ -15,6 +15,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -133,7 +134,9 @@ def made_once(folder: Path, data: tuple[Any, ...], make: Callable[[], Any]) -> A
     kept = folder / f"drawn-{name}.pickle"
     if not kept.exists():
         (draft := kept.with_suffix(f".{os.getpid()}")).write_bytes(pickle.dumps(make()))
-        draft.rename(kept)
+        with suppress(FileExistsError):  # of another worker, which was first: its picture is in reports by now
+            kept.hardlink_to(draft)
+        draft.unlink()
     return pickle.loads(kept.read_bytes())
 
 
