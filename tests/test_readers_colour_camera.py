@@ -106,6 +106,19 @@ def test_colour_of_another_moment_is_paired_anew_before_it_is_drawn_on_depth(
     assert len(source.files) == 40
 
 
+def test_colour_is_paired_anew_by_number_where_frames_have_no_depth(tmp_path: Path) -> None:
+    folder = tmp_path / "seq-01"
+    reader = swaying(folder, 1, lambda u: round(525 / 585 * (u - 320) + 320 - 13.125))
+    for number in (4, 18):
+        (folder / f"frame-{number:06d}.depth.png").unlink()
+    source = reader.open(folder)
+    assert [note.detail for note in source.doubts if note.kind == "colour paired anew"] == ["1 frame later"]
+    for frame in source.frames[:-1]:
+        assert frame.read_colour.args[0].name == f"frame-{frame.frame_id + 1:06d}.color.png"
+    assert source.frames[-1].read_colour is None
+    assert {f"frame-{number:06d}.color.png" for number in (4, 18)} <= {path.name for path in source.files}
+
+
 def test_registered_colour_is_left_to_who_runs_the_sequence(tmp_path: Path) -> None:
     folder = tmp_path / "seq-01"
     assert swaying(folder, 2, lambda u: u).open(folder).doubts == ()

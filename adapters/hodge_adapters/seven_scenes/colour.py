@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -66,19 +66,20 @@ def is_unregistered(colour: Sequence[Path], depth: Sequence[DepthFile]) -> bool:
     """
     if len(depth) < FEWEST_FRAMES or depth[0].size != SIZE:
         return False
-    found = _sampled(colour, depth, evenly(len(depth), FRAMES).tolist(), (0,))
+    found = _sampled(lambda _: colour, depth, evenly(len(depth), FRAMES).tolist(), (0,))
     gains = found[:, 0, 0] - found[:, 0, 1]
     return len(gains) >= FEWEST_FRAMES and bool(gains.mean() > SURE * gains.std() / np.sqrt(len(gains)))
 
 
-def frames_late(colour: Sequence[Path | None], depth: Sequence[DepthFile]) -> int:
+def frames_late(colour: Callable[[int], Sequence[Path | None]], depth: Sequence[DepthFile]) -> int:
     """How many frames later the colour of an unregistered camera is to be taken, negative: earlier; 0 where no other
-    moment is surely better than every other, or the best one is an end of those tried.
+    moment is surely better than every other, or the best one is an end of those tried. `colour` gives the images of so
+    many frames later.
     """
-    inner = np.arange(MOST_LATE, len(depth) - MOST_LATE)
-    if len(inner) < FEWEST_LATE or depth[0].size != SIZE:
+    if len(depth) < FEWEST_LATE or depth[0].size != SIZE:
         return 0
-    rows = inner[evenly(len(inner), FRAMES)].tolist()
+    whole = np.flatnonzero([None not in images for images in zip(*map(colour, EVERY_LATE), strict=True)])
+    rows = whole[evenly(len(whole), FRAMES)].tolist()
     if _is_best(_sampled(colour, depth, rows, NEAR_LATE)) == (NEAR_LATE.index(0), 0):
         return 0
     best = _is_best(_sampled(colour, depth, rows, EVERY_LATE))
@@ -99,14 +100,14 @@ def _is_best(found: Floats) -> tuple[int, int] | None:
 
 
 def _sampled(
-    colour: Sequence[Path | None], depth: Sequence[DepthFile], rows: Sequence[int], late: Sequence[int]
+    colour: Callable[[int], Sequence[Path | None]], depth: Sequence[DepthFile], rows: Sequence[int], late: Sequence[int]
 ) -> Floats:
     """The agreement (F, M, 2) of depth of these rows with colour of so many frames later, see `_agreement`; without
     rows that lack an image, or one that can be read, or have too few edges.
     """
-    out = []
+    out, each_moment = [], [colour(step) for step in late]
     for row in rows:
-        own, paths = depth[row], [path for step in late if (path := colour[row + step]) is not None]
+        own, paths = depth[row], [path for images in each_moment if (path := images[row]) is not None]
         try:
             edges = depth_edges(own.read()) if len(paths) == len(late) else None
             images = (pixels.read_colour(path, size=own.size) for path in paths)

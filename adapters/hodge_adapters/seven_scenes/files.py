@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -24,6 +25,10 @@ SPLIT_FILES = {"train": "TrainSplit.txt", "test": "TestSplit.txt"}
 FRAME_FILE = re.compile(r"frame-(\d{1,18})\.(color|depth|pose)\.(png|jpg|jpeg|txt)$", re.IGNORECASE)
 _SEQUENCE = re.compile(r"(?:seq|sequence)-?(\d+)$", re.IGNORECASE)
 _PACKED = re.compile(r"(?:seq|sequence)-?(\d+)\.zip$", re.IGNORECASE)
+
+
+Colours: TypeAlias = dict[tuple[str, int], Path]
+"""Colour images by their sequence and number."""
 
 
 @dataclass(frozen=True)
@@ -79,15 +84,19 @@ def split_numbers(path: Path, split: str) -> set[int]:
 
 def with_depth(
     path: Path, chosen: Sequence[tuple[str, Path]], notes: list[str]
-) -> tuple[list[FrameFiles], tuple[Note, ...]]:
-    """The frames that have a depth image, ranked within their sequence; the others are noted, and many a doubt."""
+) -> tuple[list[FrameFiles], Colours, tuple[Note, ...]]:
+    """The frames that have a depth image, ranked within their sequence; the others are noted, and many a doubt. Beside
+    them every colour image.
+    """
     usable: list[FrameFiles] = []
+    colours: Colours = {}
     missing: list[str] = []
     for name, folder in chosen:
         listing = _list_numbers(folder)
         if not listing:
             notes.append(f"{name}: no frames in it")
         complete = [number for number in sorted(listing) if "depth" in listing[number]]
+        colours |= {(name, number): files["color"] for number, files in listing.items() if "color" in files}
         missing.extend(f"{name}/{number:06d}" for number in sorted(listing.keys() - complete))
         usable.extend(FrameFiles(name, number, rank, listing[number]) for rank, number in enumerate(complete))
     if not usable and packed_sequences(path):
@@ -105,20 +114,21 @@ def with_depth(
     total = len(usable) + len(missing)
     lost = (Note("images missing", len(missing), f"{total} depth images"),) * (len(missing) > MISSING * total)
     unpaired = unpaired_doubts(["color" in files.paths for files in usable]) if len(colourless) < len(usable) else ()
-    return usable, (*lost, *unpaired)
+    return usable, colours, (*lost, *unpaired)
 
 
-def with_colour_of(usable: Sequence[FrameFiles], late: int) -> list[FrameFiles]:
-    """The frames, each with the colour image of the one so many frames later in its sequence; without where there is
-    none.
-    """
+def colours_of(usable: Sequence[FrameFiles], colours: Colours, late: int) -> list[Path | None]:
+    """The colour image of the frame so many frames later than each, by their numbers in its sequence; None without."""
+    step = int(np.median(np.diff([files.number for files in usable]))) if late else 0  # 1 of a sequence that is whole
+    return [colours.get((files.sequence, files.number + late * step)) for files in usable]
+
+
+def with_colour_of(usable: Sequence[FrameFiles], colours: Colours, late: int) -> list[FrameFiles]:
+    """The frames, each with its colour image of `colours_of`."""
     paired = list[FrameFiles]()
-    for row, files in enumerate(usable):
-        other = usable[row + late] if 0 <= row + late < len(usable) else None
+    for files, colour in zip(usable, colours_of(usable, colours, late), strict=True):
         paths = {what: path for what, path in files.paths.items() if what != "color"}
-        if other is not None and other.sequence == files.sequence and "color" in other.paths:
-            paths["color"] = other.paths["color"]
-        paired.append(replace(files, paths=paths))
+        paired.append(replace(files, paths=paths if colour is None else {**paths, "color": colour}))
     return paired
 
 

@@ -30,7 +30,9 @@ from hodge_adapters.seven_scenes.colour import (
 )
 from hodge_adapters.seven_scenes.files import (
     FRAME_FILE,
+    Colours,
     FrameFiles,
+    colours_of,
     packed_sequences,
     read_poses,
     sequence_folders,
@@ -99,12 +101,13 @@ class SevenScenesReader:
         """
         path = Path(path)
         notes: list[str] = []
-        usable, doubts = with_depth(path, self._chosen(path, notes), notes)
+        usable, every_colour, doubts = with_depth(path, self._chosen(path, notes), notes)
         camera, camera_files = self._camera(path, usable, notes)
         colours = [files.paths.get("color") for files in usable]
         colour_size = pixels.colour_size(colours, (camera.width, camera.height), notes)
-        images = sorted(file for files in usable for file in files.paths.values())
-        usable, late = self._paired(usable, camera)
+        images = {file for files in usable for file in files.paths.values()}
+        usable, late = self._paired(usable, every_colour, camera)
+        images |= {file for files in usable for file in files.paths.values()}
         is_unregistered = self._is_unregistered(usable, camera, notes)
         poses = read_poses(usable, notes)
         several = len({files.sequence for files in usable}) > 1
@@ -119,7 +122,7 @@ class SevenScenesReader:
             notes=tuple(notes),
             doubts=(*doubts, *late),
             numbered_hz=VIDEO_HZ,
-            files=(*camera_files, *images),
+            files=(*camera_files, *sorted(images)),
         )
 
     def _chosen(self, path: Path, notes: list[str]) -> list[tuple[str, Path]]:
@@ -160,7 +163,9 @@ class SevenScenesReader:
         camera = found.camera_of(depth, notes)
         return camera, tuple(beside[:1])
 
-    def _paired(self, usable: list[FrameFiles], camera: Camera) -> tuple[list[FrameFiles], tuple[Note, ...]]:
+    def _paired(
+        self, usable: list[FrameFiles], colours: Colours, camera: Camera
+    ) -> tuple[list[FrameFiles], tuple[Note, ...]]:
         """The frames, each with the colour of its moment, and a note where the files have that of another.
 
         Colour of a camera beside the depth camera alone: registered colour is tried by who runs the sequence.
@@ -168,11 +173,11 @@ class SevenScenesReader:
         if self.colour_camera == "same":
             return usable, ()
         depth = [self._depth(files, camera) for files in usable]
-        late = frames_late([files.paths.get("color") for files in usable], depth)
+        late = frames_late(partial(colours_of, usable, colours), depth)
         if not late:
             return usable, ()
         told = f"{counted(abs(late), 'frame')} {'later' if late > 0 else 'earlier'}"
-        return with_colour_of(usable, late), (Note("colour paired anew", late, told),)
+        return with_colour_of(usable, colours, late), (Note("colour paired anew", late, told),)
 
     def _is_unregistered(self, usable: Sequence[FrameFiles], camera: Camera, notes: list[str]) -> bool:
         """Whether colour is unregistered, of a Kinect's colour camera beside the depth camera."""
