@@ -1,12 +1,13 @@
-"""Parts of a model that share no points: nothing tells how they lie to each other."""
+"""Parts of a model that share no points, or too few: nothing tells how they lie to each other."""
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.refine.reprojection_cost import named
-from hodge_pipeline.types import Bools
+from hodge_pipeline.types import Bools, Ints
 from hodge_pipeline.types.tracked_model import TrackedModel
 
 LEAST_SHARED = 3
@@ -23,7 +24,7 @@ def pieces_doubt(model: TrackedModel) -> str:
 
 def apart_from_largest(model: TrackedModel) -> Bools:
     """Bodies (B,) that points do not tie to the largest piece: with fewer than `LEAST_SHARED` points that other bodies
-    see, or in a piece of their own.
+    see, in a piece of their own, or in a group that shares fewer with all others, as two rows that one point joins.
     """
     quality, count = model.quality, len(model.body_names)
     seen = np.unique(np.stack([model.body_of_frame[quality.keypoints[:, 0]], quality.point_rows], axis=1), axis=0)
@@ -36,4 +37,22 @@ def apart_from_largest(model: TrackedModel) -> Bools:
         seen = seen[kept]
     piece = connected_components(seen + np.array([0, count]), count + quality.points)[:count]
     sizes = np.bincount(piece, enough)
-    return np.asarray(~enough | (piece != np.argmax(sizes)))
+    group, ties = _groups(seen, (count, quality.points))
+    largest = group == np.argmax(np.bincount(group, enough))
+    return np.asarray(~enough | (piece != np.argmax(sizes)) | ((ties < LEAST_SHARED)[group] & ~largest))
+
+
+def _groups(seen: Ints, shape: tuple[int, int]) -> tuple[Ints, Ints]:
+    """The group (B,) of each body, and how many points each of the G groups shares with others (G,), from who sees what
+    (N, 2), of B bodies and P points. Two groups that share `LEAST_SHARED` points are one.
+    """
+    group = np.arange(shape[0])
+    while True:
+        size = int(group.max()) + 1
+        rows = np.unique(np.stack([group[seen[:, 0]], seen[:, 1]]), axis=1)
+        sees = csr_array((np.ones(rows.shape[1], np.int64), tuple(rows)), (size, shape[1]))
+        shared = (sees @ sees.T >= LEAST_SHARED).tocoo()
+        merged = connected_components(np.stack([shared.row, shared.col], axis=1), size)
+        if int(merged.max()) + 1 == size:
+            return group, sees @ (sees.sum(axis=0) > 1)
+        group = merged[group]
