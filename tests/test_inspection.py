@@ -240,8 +240,8 @@ def test_of_a_long_folder_a_few_images_are_decoded(data_dir: Path, monkeypatch: 
     decode, decoded = cv2.imdecode, []
     monkeypatch.setattr(cv2, "imdecode", lambda *given: decoded.append(1) or decode(*given))
     facts = inspect(data_dir / "seven_scenes/redkitchen")
-    # depth and colour, of frames looked into and of those that tell the colour camera
-    assert 0 < len(decoded) <= 2 * (8 + 8)
+    # depth and colour, of frames looked into and of those that tell the colour camera; colour of three moments
+    assert 0 < len(decoded) <= 2 * (8 + 8) + 8 * (1 + 3)
     assert facts["frames"] == 250 and facts["frames looked into"] == 8 and facts["oddities"] == []
 
 
