@@ -209,7 +209,8 @@ def test_a_task_of_the_script_itself_is_refused_in_one_line(tmp_path: Path) -> N
     assert "a module of its own" in done.stdout
 
 
-def test_leaving_early_leaves_no_orphans() -> None:
+def test_leaving_early_leaves_no_orphans(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hodge_pipeline.executors.local._cores", lambda: 2)
     before = set(psutil.Process().children(recursive=True))
     with LocalExecutor(workers=2).open() as workers:
         next(workers.map(square, range(100)))
