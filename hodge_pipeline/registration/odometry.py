@@ -118,7 +118,7 @@ def odometry(
     )
     notes += tuple(
         f"tracking was lost between rows {i} and {j} (surfaces fit, but one camera saw through what the other saw): no "
-        "edge there, the motion is guessed"
+        "edge there, its motion is as good as a guess"
         for i, j in steps.pairs[slid]
     )
     return Odometry(poses, steps.select(~lost & ~slid), notes)
