@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
-import pickle
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cache, partial
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -23,112 +19,40 @@ from hodge_pipeline.demo.sweeps import FARTHEST_M, REVOLUTION_S, SpinningScanner
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.registration import scan_to_map
-from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.scan_to_map import ScanToMap
 from hodge_pipeline.registration.sweeps import (
-    BACKWARDS,
-    FORWARDS,
-    UNUSED,
     deskewed,
     deskewed_frame,
-    turned,
-    turns_by_order,
 )
 from hodge_pipeline.sources.frame_facts import frame_facts
-from hodge_pipeline.stages import Step, Steps, no_progress
-from hodge_pipeline.start.sweeps import Sweeps, _jumps, deskewed_along, follow, key_rows
-from hodge_pipeline.types import Floats, Frame, Ints, PointCloud, Source
-from hodge_pipeline.types.notes import Note
-from hodge_pipeline.uses.trajectory import refine_trajectory
-from lidar_worlds import CarFree, scanner_in
-
-Sweeping = Sequence[tuple[int, float, PointCloud]]
-JUDGE = "hodge_pipeline.start.sweeps.sense_of_times"
-COUNT, SPEED_M_S, UNIX_S = 24, 10.0, 1.7e9
-NEAR_M = 0.1
-"""Whole sequences are off by 0.02 m; a sweep followed from a wrong velocity by half a metre and more."""
-
-
-@cache
-def street() -> list[Frame]:
-    """Revolutions along a street by their numbers."""
-    own = SpinningScanner(Road(SPEED_M_S), 0, beams=16, columns=360, noise=1.0)
-    return frames_of([own.sweep(number) for number in range(COUNT)])
-
-
-def once(what: Callable[..., object]) -> Callable[..., object]:
-    """A function whose answers are kept; the last argument is sweeps."""
-    found = dict[str, bytes]()
-
-    def answer(*given: object) -> object:
-        *others, sweeps = given
-        content = [(row, at, one.points_in_cam, one.times_s) for row, at, one in cast(Sweeping, sweeps)]
-        key = hashlib.sha256(pickle.dumps((others, content))).hexdigest()
-        if key not in found:
-            found[key] = pickle.dumps(what(*given))
-        return pickle.loads(found[key])
-
-    return answer
+from hodge_pipeline.start.sweeps import Sweeps, _jumps, key_rows
+from hodge_pipeline.types import Frame, PointCloud
+from lidar_worlds import scanner_in
+from street_sweeps import (
+    COUNT,
+    NEAR_M,
+    SPEED_M_S,
+    UNIX_S,
+    changed,
+    corner,
+    followed,
+    street,
+    street_followed,
+    true_at,
+    true_poses,
+    warmed_up_once,
+    without_order,
+)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def warm_up_once() -> Iterator[None]:
-    """What the first of the same sweeps tell is found once, times are judged only in tests of that: both are most of
-    what following so few sweeps costs.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hodge_pipeline.start.sweeps.first_velocity", once(scan_to_map.first_velocity))
-        patch.setattr(JUDGE, lambda _, __, told, ___: told)
+    with warmed_up_once():
         yield
-
-
-@pytest.fixture
-def times_judged(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(JUDGE, scan_to_map.sense_of_times)
-
-
-def same(cloud: PointCloud) -> PointCloud:
-    return cloud
-
-
-def frames_of(sweeps: list[object]) -> list[Frame]:
-    clouds = [PointCloud(sweep.points, times_s=sweep.times_s) for sweep in sweeps]  # type: ignore[attr-defined]
-    return [Frame(f"{number}.pcd", float(number), read_points=partial(same, c)) for number, c in enumerate(clouds)]
-
-
-def true_poses(rows: Ints | Sequence[int]) -> Floats:
-    return Road(SPEED_M_S).world_from_car(np.asarray(rows) * REVOLUTION_S)
-
-
-def changed(frame: Frame, change: Callable[[PointCloud], PointCloud]) -> Frame:
-    read = frame.read_points
-    assert read is not None
-    return replace(frame, read_points=lambda: change(read()))
 
 
 def broken(cloud: PointCloud) -> PointCloud:
     raise SourceError("cut off")
-
-
-def followed(
-    frames: list[Frame], sequences: tuple[Ints, ...] | None = None, max_range_m: float = FARTHEST_M
-) -> tuple[Sweeps, str]:
-    """What is found, and what is said."""
-    said: list[str] = []
-    step = Step(Path(), no_progress, lambda *notes: said.extend(map(str, notes)))
-    source = Source("street", Path("street"), tuple(frames))
-    every = (np.arange(len(frames)),) if sequences is None else sequences
-    return follow(source, every, CloudOptions(max_range_m=max_range_m, voxel_m=0.5), None, step=step), "\n".join(said)
-
-
-@cache
-def street_followed() -> tuple[Sweeps, str]:
-    return followed(street())
-
-
-def without_order(cloud: PointCloud) -> PointCloud:
-    """The points, lowest first, without times."""
-    return PointCloud(cloud.points_in_cam[np.argsort(cloud.points_in_cam[:, 2])])
 
 
 def test_sweeps_after_unread_ones_are_followed() -> None:
@@ -212,19 +136,6 @@ def test_braking_is_even_motion_and_a_displaced_pose_is_not(step_s: float) -> No
     assert [name.split(":")[0] for name in _jumps(names, poses, times, 0.5)] == ["14"]
 
 
-@cache
-def corner() -> list[Frame]:
-    """Revolutions around a corner of the street, by the seconds since 1970 at which they begin."""
-    own = SpinningScanner(Road(7.0), 0, beams=16, columns=240, noise=1.0)
-    frames = frames_of([own.sweep(number) for number in range(190, 214)])
-    return [replace(frame, stamp_s=UNIX_S + number * REVOLUTION_S) for number, frame in enumerate(frames, 190)]
-
-
-def true_at(seconds: Floats | list[float]) -> Floats:
-    """Where the scanner of that corner was, seconds after UNIX_S."""
-    return Road(7.0).world_from_car(np.asarray(seconds))
-
-
 @pytest.mark.parametrize(
     ("first_s", "is_last"),
     [(-REVOLUTION_S, True), (UNIX_S, True), (5000.0, False)],
@@ -244,51 +155,6 @@ def test_poses_are_those_at_the_stamps(first_s: float, is_last: bool) -> None:
     read, of_sensor = deskewed_frame(clocked[12], velocity).read_points, frames[12].read_points
     assert read is not None and of_sensor is not None
     assert read().points_in_cam == pytest.approx(deskewed(of_sensor(), velocity, late_s).points_in_cam, abs=1e-3)
-
-
-def test_sweeps_of_given_poses_are_deskewed_by_them() -> None:
-    frames = corner()
-    exact = true_at([frame.stamp_s - UNIX_S for frame in frames])
-    noise = np.random.default_rng(0).normal(0, [5e-4] * 3 + [0.02] * 3, (len(frames), 6))
-    given = exact @ se3.exp(np.cumsum(noise, axis=0))
-    refined = refine_trajectory(given, frames, overrides=["recording.level=off", "executor.workers=0"])
-    assert not refined.decision.keeps_input
-    before, after = (absolute_error(poses, exact).rmse_m for poses in (given, refined.poses))
-    assert after < 0.75 * before  # skewed around a corner, they fit each other where the scanner was not
-
-
-@pytest.mark.usefixtures("times_judged")
-def test_backward_times_of_sweeps_with_given_poses_are_turned_and_named() -> None:
-    notes = list[Note]()
-    steps = cast(Steps, SimpleNamespace(note=notes.append))
-    source = Source("sweeps", Path("sweeps"), tuple(changed(frame, turned) for frame in street()))
-    made = deskewed_along(source, true_poses(range(COUNT)), CloudOptions(max_range_m=FARTHEST_M), steps)
-    assert [note.kind for note in notes] == ["times backwards"]
-    got, own = made.frames[12].read_points, street()[12].read_points
-    assert got is not None and own is not None
-    right = deskewed(own(), np.array([0, 0, 0, SPEED_M_S, 0, 0])).points_in_cam
-    assert np.abs(got().points_in_cam - right).max() < 0.2 < np.abs(own().points_in_cam - right).max()
-
-
-@pytest.mark.parametrize(("apart_s", "told"), [(0.1, ["sweeps untimed"]), (30.0, [])])
-def test_given_poses_of_sweeps_without_times_are_told_and_those_of_stations_are_not(
-    apart_s: float, told: list[str]
-) -> None:
-    frames = [
-        changed(replace(frame, stamp_s=UNIX_S + row * apart_s), without_order) for row, frame in enumerate(corner()[:4])
-    ]
-    source, notes = Source("sweeps", Path("sweeps"), tuple(frames)), list[Note]()
-    steps = cast(Steps, SimpleNamespace(note=notes.append))
-    assert deskewed_along(source, np.tile(np.eye(4), (4, 1, 1)), CloudOptions(), steps) is source
-    assert [note.kind for note in notes] == told
-
-
-def test_times_that_run_backwards_are_turned_in_all_sweeps_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    right, _ = street_followed()
-    monkeypatch.setattr(JUDGE, lambda *_: BACKWARDS)
-    found, said = followed([changed(frame, turned) for frame in street()])
-    assert "seem to run backwards" in said and "24 of 24 sweeps" in said and (found.sense == BACKWARDS).all()
-    np.testing.assert_allclose(found.world_from_scan, right.world_from_scan, atol=1e-3)
 
 
 def test_every_third_sweep_is_deskewed_by_its_own_speed() -> None:
@@ -335,92 +201,6 @@ def test_a_scanner_whose_sweeps_cannot_be_read_leaves_the_other_be() -> None:
     assert found.found.tolist() == [True] * 10 + [False] * 10 and "5 more frames: the sweep is left out" in said
     with pytest.raises(SourceError, match="none of the 10 sweeps gave points in range; the first: frame 0.pcd"):
         followed(frames[10:])
-
-
-@dataclass(frozen=True)
-class Turning(CarFree):
-    """A walk that begins in a turn of 90 degrees a second."""
-
-    length_m: float = 1e9
-
-    def world_from_car(self, times_s: Floats) -> Floats:
-        """Poses (N, 4, 4)."""
-        t = np.asarray(times_s, float)
-        position = np.stack([-60 + 2 * t, -52 + 0 * t, 1.9 + 0 * t], axis=1)
-        return se3.from_parts(se3.so3_exp(np.stack([0 * t, 0 * t, np.pi / 2 * t], axis=1)), position)
-
-
-@pytest.mark.usefixtures("times_judged")
-def test_a_turn_from_the_first_sweep_on_is_followed() -> None:
-    own = SpinningScanner(cast(Road, Turning()), 0, beams=16, columns=360, noise=1.0)
-    found, _ = followed(frames_of([own.sweep(number) for number in range(COUNT)]))
-    assert (found.sense == FORWARDS).all()
-    exact = Turning().world_from_car(np.arange(COUNT) * REVOLUTION_S)
-    assert absolute_error(found.world_from_scan, exact).max_m < NEAR_M
-
-
-def test_times_that_run_backwards_or_are_of_deskewed_points_are_told_by_the_points_on_the_map() -> None:
-    scanner = SpinningScanner(Road(20.0), 0, beams=16, columns=360, noise=1.0)
-    right = [PointCloud(sweep.points, times_s=sweep.times_s) for sweep in map(scanner.sweep, range(12))]
-    velocity = np.array([0, 0, 0, 20.0, 0, 0])
-    flat = [replace(cloud, points_in_cam=deskewed(cloud, velocity).points_in_cam) for cloud in right]
-    for clouds, sense in ((right, FORWARDS), ([turned(cloud) for cloud in right], BACKWARDS), (flat, UNUSED)):
-        given = [(row, row * REVOLUTION_S, cloud) for row, cloud in enumerate(clouds)]
-        assert scan_to_map.sense_of_times(0.5, velocity, FORWARDS, given) == sense
-        if clouds is right:  # as of times by the order of points
-            assert scan_to_map.sense_of_times(0.5, velocity, UNUSED, given) == sense
-
-
-def test_the_order_of_points_tells_how_a_scanner_spun_and_no_other_order_does() -> None:
-    read = street()[3].read_points
-    assert read is not None
-    cloud = read()
-    assert cloud.times_s is not None
-    points, turns = cloud.points_in_cam, cloud.times_s / REVOLUTION_S
-    got = turns_by_order(points)
-    assert got is not None and np.abs(got - got[0] - (turns - turns[0])).max() < 0.02
-    lost = (turns < 0.3) | (turns > 0.55)
-    got = turns_by_order(points[lost])
-    assert got is not None and np.quantile(np.abs(got - (turns - turns[0])[lost]), 0.99) < 0.02
-    rings = np.argsort(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])).round(3), kind="stable")
-    for order in (rings, np.argsort(points[:, 0]), np.random.default_rng(0).permutation(len(points))):
-        assert turns_by_order(points[order]) is None
-    assert turns_by_order(points[turns < 0.3]) is None  # such as the columns of a camera's image
-
-
-def untimed(cloud: PointCloud) -> PointCloud:
-    return replace(cloud, times_s=None)
-
-
-def test_points_without_times_are_deskewed_by_their_order_where_the_map_is_sure_of_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    frames = [changed(frame, untimed) for frame in street()]
-    judged = list[tuple[int, int]]()
-
-    def sure(_: float, __: Floats, told: int, sweeps: Sweeping) -> int:
-        judged.append((told, len(sweeps)))
-        return FORWARDS
-
-    monkeypatch.setattr(JUDGE, sure)
-    found, said = followed(frames)
-    assert judged == [(UNUSED, 20)]
-    assert "points of 24 of 24 sweeps have no times" in said and "their times are told by it" in said
-    assert absolute_error(found.world_from_scan, true_poses(range(COUNT))).max_m < NEAR_M
-    right, _ = street_followed()
-    np.testing.assert_allclose(found.velocity, right.velocity, atol=0.3)
-
-
-@pytest.mark.usefixtures("times_judged")
-def test_points_deskewed_before_stay_as_they_are_and_poses_are_those_without_an_order() -> None:
-    velocity = np.array([0, 0, 0, SPEED_M_S, 0, 0])
-    flat = [changed(frame, lambda cloud: deskewed(cloud, velocity)) for frame in street()]
-    found, said = followed(flat)
-    assert "each is taken as measured in an instant" in said and not found.revolution_s.any()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hodge_pipeline.start.sweep_reading.turns_by_order", lambda _: None)
-        unordered, _ = followed(flat)
-    np.testing.assert_array_equal(found.world_from_scan, unordered.world_from_scan)
 
 
 def test_names_of_times_are_seconds_in_their_order(tmp_path: Path) -> None:

@@ -287,19 +287,16 @@ class _Map:
         least = max(min(one.error / one.num_inliers for one in held), 1e-12)
         is_after_hole = len(guesses) > 1
         usual = _usual(self._errors) if is_after_hole and len(self._errors) >= FEWEST_USUAL else least
-        placed = [
-            (np.asarray(one.T_target_source), self._information(one, max(least, usual)), one.num_inliers)
-            for one in held
-        ]
-        costs = [
-            (one.error / usual + (count - one.num_inliers) * UNMATCHED) / SHARED_ERRORS**2
-            + (surprise(pose, information) if is_after_hole else 0.0)
-            for one, (pose, information, _) in zip(held, placed, strict=True)
-        ]
-        best = int(np.argmin(costs))
-        pose, _, inliers = placed[best]
-        self._share, self._error = inliers / count, held[best].error / inliers
-        return pose, self._information(held[best], least)
+
+        def cost(one: Any) -> float:
+            by_points = (one.error / usual + (count - one.num_inliers) * UNMATCHED) / SHARED_ERRORS**2
+            if not is_after_hole:
+                return float(by_points)
+            return float(by_points + surprise(one.T_target_source, self._information(one, max(least, usual))))
+
+        best = min(held, key=cost)
+        self._share, self._error = best.num_inliers / count, best.error / best.num_inliers
+        return np.asarray(best.T_target_source), self._information(best, least)
 
     def _information(self, aligned: Any, error: float) -> Floats:
         """The information (6, 6) of an alignment whose points have this mean error."""

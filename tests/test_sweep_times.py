@@ -1,0 +1,193 @@
+"""When points of sweeps were measured: times told, backwards, by their order, or of sweeps deskewed before."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from hodge_pipeline import se3
+from hodge_pipeline.demo.street import Road
+from hodge_pipeline.demo.sweeps import FARTHEST_M, REVOLUTION_S, SpinningScanner
+from hodge_pipeline.evaluation.trajectory import absolute_error
+from hodge_pipeline.registration import scan_to_map
+from hodge_pipeline.registration.clouds import CloudOptions
+from hodge_pipeline.registration.sweeps import (
+    BACKWARDS,
+    FORWARDS,
+    UNUSED,
+    deskewed,
+    turned,
+    turns_by_order,
+)
+from hodge_pipeline.stages import Steps
+from hodge_pipeline.start.sweeps import deskewed_along
+from hodge_pipeline.types import Floats, PointCloud, Source
+from hodge_pipeline.types.notes import Note
+from hodge_pipeline.uses.trajectory import refine_trajectory
+from lidar_worlds import CarFree
+from street_sweeps import (
+    COUNT,
+    JUDGE,
+    NEAR_M,
+    SPEED_M_S,
+    UNIX_S,
+    Sweeping,
+    changed,
+    corner,
+    followed,
+    frames_of,
+    street,
+    street_followed,
+    true_at,
+    true_poses,
+    warmed_up_once,
+    without_order,
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def warm_up_once() -> Iterator[None]:
+    with warmed_up_once():
+        yield
+
+
+@pytest.fixture
+def times_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(JUDGE, scan_to_map.sense_of_times)
+
+
+def test_sweeps_of_given_poses_are_deskewed_by_them() -> None:
+    frames = corner()
+    exact = true_at([frame.stamp_s - UNIX_S for frame in frames])
+    noise = np.random.default_rng(0).normal(0, [5e-4] * 3 + [0.02] * 3, (len(frames), 6))
+    given = exact @ se3.exp(np.cumsum(noise, axis=0))
+    refined = refine_trajectory(given, frames, overrides=["recording.level=off", "executor.workers=0"])
+    assert not refined.decision.keeps_input
+    before, after = (absolute_error(poses, exact).rmse_m for poses in (given, refined.poses))
+    assert after < 0.75 * before  # skewed around a corner, they fit each other where the scanner was not
+
+
+@pytest.mark.usefixtures("times_judged")
+def test_backward_times_of_sweeps_with_given_poses_are_turned_and_named() -> None:
+    notes = list[Note]()
+    steps = cast(Steps, SimpleNamespace(note=notes.append))
+    source = Source("sweeps", Path("sweeps"), tuple(changed(frame, turned) for frame in street()))
+    made = deskewed_along(source, true_poses(range(COUNT)), CloudOptions(max_range_m=FARTHEST_M), steps)
+    assert [note.kind for note in notes] == ["times backwards"]
+    got, own = made.frames[12].read_points, street()[12].read_points
+    assert got is not None and own is not None
+    right = deskewed(own(), np.array([0, 0, 0, SPEED_M_S, 0, 0])).points_in_cam
+    assert np.abs(got().points_in_cam - right).max() < 0.2 < np.abs(own().points_in_cam - right).max()
+
+
+@pytest.mark.parametrize(("apart_s", "told"), [(0.1, ["sweeps untimed"]), (30.0, [])])
+def test_given_poses_of_sweeps_without_times_are_told_and_those_of_stations_are_not(
+    apart_s: float, told: list[str]
+) -> None:
+    frames = [
+        changed(replace(frame, stamp_s=UNIX_S + row * apart_s), without_order) for row, frame in enumerate(corner()[:4])
+    ]
+    source, notes = Source("sweeps", Path("sweeps"), tuple(frames)), list[Note]()
+    steps = cast(Steps, SimpleNamespace(note=notes.append))
+    assert deskewed_along(source, np.tile(np.eye(4), (4, 1, 1)), CloudOptions(), steps) is source
+    assert [note.kind for note in notes] == told
+
+
+def test_times_that_run_backwards_are_turned_in_all_sweeps_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    right, _ = street_followed()
+    monkeypatch.setattr(JUDGE, lambda *_: BACKWARDS)
+    found, said = followed([changed(frame, turned) for frame in street()])
+    assert "seem to run backwards" in said and "24 of 24 sweeps" in said and (found.sense == BACKWARDS).all()
+    np.testing.assert_allclose(found.world_from_scan, right.world_from_scan, atol=1e-3)
+
+
+@dataclass(frozen=True)
+class Turning(CarFree):
+    """A walk that begins in a turn of 90 degrees a second."""
+
+    length_m: float = 1e9
+
+    def world_from_car(self, times_s: Floats) -> Floats:
+        """Poses (N, 4, 4)."""
+        t = np.asarray(times_s, float)
+        position = np.stack([-60 + 2 * t, -52 + 0 * t, 1.9 + 0 * t], axis=1)
+        return se3.from_parts(se3.so3_exp(np.stack([0 * t, 0 * t, np.pi / 2 * t], axis=1)), position)
+
+
+@pytest.mark.usefixtures("times_judged")
+def test_a_turn_from_the_first_sweep_on_is_followed() -> None:
+    own = SpinningScanner(cast(Road, Turning()), 0, beams=16, columns=360, noise=1.0)
+    found, _ = followed(frames_of([own.sweep(number) for number in range(COUNT)]))
+    assert (found.sense == FORWARDS).all()
+    exact = Turning().world_from_car(np.arange(COUNT) * REVOLUTION_S)
+    assert absolute_error(found.world_from_scan, exact).max_m < NEAR_M
+
+
+def test_times_that_run_backwards_or_are_of_deskewed_points_are_told_by_the_points_on_the_map() -> None:
+    scanner = SpinningScanner(Road(20.0), 0, beams=16, columns=360, noise=1.0)
+    right = [PointCloud(sweep.points, times_s=sweep.times_s) for sweep in map(scanner.sweep, range(12))]
+    velocity = np.array([0, 0, 0, 20.0, 0, 0])
+    flat = [replace(cloud, points_in_cam=deskewed(cloud, velocity).points_in_cam) for cloud in right]
+    for clouds, sense in ((right, FORWARDS), ([turned(cloud) for cloud in right], BACKWARDS), (flat, UNUSED)):
+        given = [(row, row * REVOLUTION_S, cloud) for row, cloud in enumerate(clouds)]
+        assert scan_to_map.sense_of_times(0.5, velocity, FORWARDS, given) == sense
+        if clouds is right:  # as of times by the order of points
+            assert scan_to_map.sense_of_times(0.5, velocity, UNUSED, given) == sense
+
+
+def test_the_order_of_points_tells_how_a_scanner_spun_and_no_other_order_does() -> None:
+    read = street()[3].read_points
+    assert read is not None
+    cloud = read()
+    assert cloud.times_s is not None
+    points, turns = cloud.points_in_cam, cloud.times_s / REVOLUTION_S
+    got = turns_by_order(points)
+    assert got is not None and np.abs(got - got[0] - (turns - turns[0])).max() < 0.02
+    lost = (turns < 0.3) | (turns > 0.55)
+    got = turns_by_order(points[lost])
+    assert got is not None and np.quantile(np.abs(got - (turns - turns[0])[lost]), 0.99) < 0.02
+    rings = np.argsort(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])).round(3), kind="stable")
+    for order in (rings, np.argsort(points[:, 0]), np.random.default_rng(0).permutation(len(points))):
+        assert turns_by_order(points[order]) is None
+    assert turns_by_order(points[turns < 0.3]) is None  # such as the columns of a camera's image
+
+
+def untimed(cloud: PointCloud) -> PointCloud:
+    return replace(cloud, times_s=None)
+
+
+def test_points_without_times_are_deskewed_by_their_order_where_the_map_is_sure_of_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    frames = [changed(frame, untimed) for frame in street()]
+    judged = list[tuple[int, int]]()
+
+    def sure(_: float, __: Floats, told: int, sweeps: Sweeping) -> int:
+        judged.append((told, len(sweeps)))
+        return FORWARDS
+
+    monkeypatch.setattr(JUDGE, sure)
+    found, said = followed(frames)
+    assert judged == [(UNUSED, 20)]
+    assert "points of 24 of 24 sweeps have no times" in said and "their times are told by it" in said
+    assert absolute_error(found.world_from_scan, true_poses(range(COUNT))).max_m < NEAR_M
+    right, _ = street_followed()
+    np.testing.assert_allclose(found.velocity, right.velocity, atol=0.3)
+
+
+@pytest.mark.usefixtures("times_judged")
+def test_points_deskewed_before_stay_as_they_are_and_poses_are_those_without_an_order() -> None:
+    velocity = np.array([0, 0, 0, SPEED_M_S, 0, 0])
+    flat = [changed(frame, lambda cloud: deskewed(cloud, velocity)) for frame in street()]
+    found, said = followed(flat)
+    assert "each is taken as measured in an instant" in said and not found.revolution_s.any()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hodge_pipeline.start.sweep_reading.turns_by_order", lambda _: None)
+        unordered, _ = followed(flat)
+    np.testing.assert_array_equal(found.world_from_scan, unordered.world_from_scan)
