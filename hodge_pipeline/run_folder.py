@@ -26,7 +26,8 @@ from hodge_pipeline.sources.opening import open_with_reader
 from hodge_pipeline.stages import FrameReader, Step
 from hodge_pipeline.store.store import stored, stored_clouds
 from hodge_pipeline.store.workspace import RECIPE_FILE, RUN, is_run_folder
-from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, Source
+from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Source
+from hodge_pipeline.types.camera import camera_numbers, camera_of
 from hodge_pipeline.types.notes import Note
 
 
@@ -57,7 +58,7 @@ class FrameTable:
             frame_ids=np.array([frame.frame_id for frame in frames]),
             stamps_s=np.array([frame.stamp_s for frame in frames], float),
             sequences=np.array([frame.sequence for frame in frames], np.str_),
-            cameras=np.array([_numbers(frame.camera) for frame in frames]).reshape(-1, 6),
+            cameras=np.array([camera_numbers(frame.camera) for frame in frames]).reshape(-1, 6),
             world_from_cam=given_poses(source),
             true_world_from_cam=true_poses(source),
         )
@@ -70,7 +71,7 @@ class FrameTable:
         )  # fmt: skip
         frames = tuple(
             Frame(
-                name, stamp, _camera(camera), world_from_cam=_known(pose), true_world_from_cam=_known(true),
+                name, stamp, camera_of(camera), world_from_cam=_known(pose), true_world_from_cam=_known(true),
                 sequence=sequence,
             )
             for name, stamp, sequence, camera, pose, true in rows
@@ -262,18 +263,6 @@ def check_layout(folder: Path) -> None:
     """Raise `WorkspaceError` where a folder is none of a run."""
     if not is_run_folder(folder):
         raise WorkspaceError(f"{folder}: is no run folder: there is no {RECIPE_FILE} with steps in it")
-
-
-def _numbers(camera: Camera | None) -> list[float]:
-    if camera is None:
-        return [np.nan] * 6
-    return [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
-
-
-def _camera(numbers: Floats) -> Camera | None:
-    if np.isnan(numbers).any():
-        return None
-    return Camera(int(numbers[0]), int(numbers[1]), *map(float, numbers[2:]))
 
 
 def _known(pose: Floats) -> Floats | None:

@@ -238,16 +238,16 @@ def test_empty_frames_are_bridged_and_a_lost_one_is_said(tmp_path: Path) -> None
 
 @pytest.mark.parametrize(("share", "pairs"), [(0.0, [[0, 1], [1, 2]]), (0.4, [[0, 1]])])
 def test_a_break_of_tracking_is_bridged_by_what_free_space_does_not_refute(
-    share: float, pairs: list[list[int]], folder: Path
+    share: float, pairs: list[list[int]], folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    tested: Any = lambda edges, *_: replace(edges, seen_through=np.full(len(edges), share))  # noqa: E731
+    monkeypatch.setattr(odometry_stage, "with_seen_through", tested)
     poses = path_of(3)
     motions = zip(se3.between(poses, np.array([[0, 1], [1, 2]])), (1.0, 0.0), strict=True)
     found = [Registration(motion, np.eye(6), fitness, 0.01, 100, 1, True) for motion, fitness in motions]
     steps = Edges.of([[0, 1], [1, 2]], "sequential").with_registrations(found)
     with HERE.open() as workers:
-        held, _ = bridge(
-            folder, [np.arange(3)], steps, poses, OdometryOptions(), workers, lambda edges: np.full(len(edges), share)
-        )
+        held, _ = bridge(CloudSet.open(folder), [np.arange(3)], steps, poses, OdometryOptions(), workers, 1.0)
     assert held.pairs[:, 1].tolist() == [pair[1] for pair in pairs]
 
 

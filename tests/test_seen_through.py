@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,10 +17,14 @@ from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.refine.model_edges import depth_edges
 from hodge_pipeline.registration.acceptance import SEEN_THROUGH, Acceptance, accepted, with_odometry
 from hodge_pipeline.registration.assessment import MOST_VIOLATION
+from hodge_pipeline.registration.clouds import CloudOptions, make_cloud
+from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.odometry import OdometryOptions, odometry
-from hodge_pipeline.registration.seen_through import seen_through
+from hodge_pipeline.registration.register import register_edges
+from hodge_pipeline.registration.seen_through import with_seen_through
 from hodge_pipeline.review.adding import Candidate, assessed
-from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, PointCloud, Registration, ViewGraph
+from hodge_pipeline.stages import Step
+from hodge_pipeline.types import Camera, CloudSet, Edges, Frame, PointCloud, Registration, ViewGraph
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 PAIRS = [[0, 1], [0, 2], [1, 2]]
@@ -34,40 +39,47 @@ def clouds() -> CloudSet:
     wall = np.stack([u, v, np.full_like(u, 2.0)], axis=-1).reshape(-1, 3)
     post = wall[np.abs(wall[:, 0]) < 0.3] * [1.0, 0.5, 0.5]
     behind = np.abs(wall[:, 0]) < 0.6
-    return CloudSet.from_clouds([PointCloud(np.concatenate([wall[~behind], post]).astype(np.float32))] * 3)
+    points = np.concatenate([wall[~behind], post]).astype(np.float32)
+    return CloudSet.from_clouds([PointCloud(points, depth_camera=CAMERA)] * 3)
 
 
 @pytest.fixture(scope="module")
-def registered() -> Edges:
+def found() -> Edges:
     motions = se3.exp(np.concatenate([np.zeros((3, 3)), SLID[:, None] * [1, 0, 0]], axis=1))
     return Edges.of(PAIRS).with_registrations([Registration(m, np.eye(6), 0.7, 0.01, 900, 5, True) for m in motions])
 
 
+@pytest.fixture(scope="module")
+def registered(clouds: CloudSet, found: Edges) -> Edges:
+    return with_seen_through(found, clouds)
+
+
 def test_what_slid_before_what_the_other_saw_through_is_no_edge(clouds: CloudSet, registered: Edges) -> None:
-    through = seen_through(registered, clouds, [CAMERA] * 3)
+    through = registered.seen_through
     assert through[0] == through[2] == 0 and through[1] > MOST_VIOLATION
-    assert np.isnan(seen_through(registered, clouds, [CAMERA, None, CAMERA])).tolist() == [True, False, True]
-    assert Acceptance(min_spread=0).reasons(registered, through=through).tolist() == ["", SEEN_THROUGH, ""]
-    assert set(Acceptance(min_spread=0, max_seen_through=None).reasons(registered, through=through)) == {""}
+    assert Acceptance(min_spread=0).reasons(registered).tolist() == ["", SEEN_THROUGH, ""]
+    assert set(Acceptance(min_spread=0, max_seen_through=None).reasons(registered)) == {""}
+    with_scan = CloudSet.from_clouds([clouds[0], replace(clouds[1], depth_camera=None), clouds[2]])
+    assert np.isnan(with_seen_through(registered, with_scan).seen_through).tolist() == [True, False, True]
 
 
 def test_the_unit_of_length_does_not_matter(clouds: CloudSet, registered: Edges) -> None:
-    large = CloudSet.from_clouds([PointCloud(100 * cloud.points_in_cam) for cloud in clouds])
+    large = CloudSet.from_clouds([PointCloud(100 * cloud.points_in_cam, depth_camera=CAMERA) for cloud in clouds])
     motions = registered.i_from_j.copy()
     motions[:, :3, 3] *= 100
-    found = seen_through(registered.put(slice(None), i_from_j=motions), large, [CAMERA] * 3, scale=100.0)
-    np.testing.assert_allclose(found, seen_through(registered, clouds, [CAMERA] * 3), atol=1e-6)
+    found = with_seen_through(registered.put(slice(None), i_from_j=motions), large, scale=100.0)
+    np.testing.assert_allclose(found.seen_through, registered.seen_through, atol=1e-6)
 
 
 def test_of_each_cloud_its_view_and_a_thousand_points_are_kept() -> None:
     count = 30
     wall = np.random.default_rng(0).uniform(-1, 1, (20000, 3)).astype(np.float32) * [1.0, 1.0, 0.0] + [0, 0, 2]
-    large = CloudSet.from_clouds([PointCloud(wall.astype(np.float32))] * count)
+    large = CloudSet.from_clouds([PointCloud(wall.astype(np.float32), depth_camera=CAMERA)] * count)
     pairs = Edges.of([(row, row + 1) for row in range(count - 1)])
     pairs = pairs.with_registrations([Registration(np.eye(4), np.eye(6), 0.7, 0.01, 900, 5, True)] * len(pairs))
     tracemalloc.start()
     try:
-        seen_through(pairs, large, [CAMERA] * count)
+        with_seen_through(pairs, large)
         peak_bytes = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -76,56 +88,75 @@ def test_of_each_cloud_its_view_and_a_thousand_points_are_kept() -> None:
     )  # of which one cloud at work takes 2 MB; whole clouds would take 14 MB
 
 
-def test_a_step_that_a_round_slides_keeps_the_measurement_of_odometry(clouds: CloudSet, registered: Edges) -> None:
-    def through(edges: Edges) -> Floats:
-        return seen_through(edges, clouds, [CAMERA] * 3)
-
-    judged, _ = accepted(registered, Acceptance(min_spread=0), None, through=through)
+def test_a_step_that_a_round_slides_keeps_the_measurement_of_odometry(registered: Edges) -> None:
+    judged, _ = accepted(registered, Acceptance(min_spread=0), None)
     assert judged.why.tolist() == ["", SEEN_THROUGH, ""]
     step = registered.select(np.array([1])).put(slice(None), proposed_by="sequential", i_from_j=np.eye(4), fitness=0.4)
     kept = with_odometry(judged, step)
     assert kept.counts.all() and np.array_equal(kept.i_from_j[1], np.eye(4))
-    any_ = accepted(registered, Acceptance(min_spread=0, max_seen_through=None), None, through=through)[0]
-    assert any_.counts.all()
+    assert accepted(registered, Acceptance(min_spread=0, max_seen_through=None), None)[0].counts.all()
 
 
 @pytest.mark.parametrize("limit", [MOST_VIOLATION, None])
 def test_odometry_is_lost_at_a_step_that_free_space_refutes(
-    clouds: CloudSet, limit: float | None, tmp_path: Path
+    clouds: CloudSet, limit: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clouds.save(tmp_path)
-    options = OdometryOptions(max_seen_through=limit)
     shares = np.array([0.0, 0.4])
+    tested: Any = lambda steps, *_: replace(steps, seen_through=shares)  # noqa: E731
+    monkeypatch.setattr("hodge_pipeline.registration.odometry.with_seen_through", tested)
     with LocalExecutor(workers=0).open() as workers:
-        found = odometry(tmp_path, [np.arange(3)], np.arange(3.0), options, workers, through=lambda steps: shares)
+        options = OdometryOptions(max_seen_through=limit)
+        found = odometry(tmp_path, [np.arange(3)], np.arange(3.0), options, workers)
     assert found.steps.pairs.tolist() == ([[0, 1]] if limit else [[0, 1], [1, 2]])
     assert len(found.notes) == (limit is not None)
     assert all("rows 1 and 2 (surfaces fit" in note for note in found.notes)
 
 
-def _frames() -> list[Frame]:
-    return [
-        Frame(row, float(row), CAMERA, read_depth=lambda: np.zeros((480, 640), np.float32), world_from_cam=np.eye(4))
-        for row in range(3)
-    ]
+@pytest.mark.parametrize("by_free_space", [True, False])
+def test_the_step_of_registration_tells_what_was_seen_through(
+    clouds: CloudSet, by_free_space: bool, tmp_path: Path
+) -> None:
+    clouds.save(tmp_path / "clouds")
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    with LocalExecutor(workers=0).open() as workers:
+        found = register_edges(
+            Edges.of(PAIRS), CloudSet.open(tmp_path / "clouds"), Gicp(), poses,
+            by_free_space=by_free_space, workers=workers, step=Step(tmp_path, lambda _: None, lambda *_: None),
+        )  # fmt: skip
+    np.testing.assert_array_equal(found.seen_through, [0.0] * 3 if by_free_space else [np.nan] * 3)
+
+
+def test_a_cloud_of_a_depth_image_knows_its_camera_and_one_of_a_scan_has_none(tmp_path: Path) -> None:
+    depth = np.full((480, 640), 2.0, np.float32)
+    of_depth = Frame(0, 0.0, CAMERA, read_depth=lambda: depth)
+    of_scan = Frame(1, 1.0, CAMERA, read_points=lambda: PointCloud(np.ones((20, 3), np.float32)))
+    made = CloudSet.from_clouds([make_cloud(frame, CloudOptions())[0] for frame in (of_depth, of_scan)])
+    made.save(tmp_path)
+    assert [cloud.depth_camera for cloud in CloudSet.open(tmp_path)] == [CAMERA, None]
 
 
 def test_review_says_of_a_pair_added_by_hand_what_the_solve_will(clouds: CloudSet) -> None:
     recipe, slid = load_recipe("seven_scenes"), se3.exp(np.array([0, 0, 0, SLID[1], 0, 0]))
     graph = ViewGraph.from_edges(np.arange(3), np.zeros((0, 2), np.int64), np.zeros((0, 4, 4)))
     poses = np.tile(np.eye(4), (3, 1, 1))
-    for motion, frames, why in ((slid, _frames(), SEEN_THROUGH), (np.eye(4), _frames(), ""), (slid, (), "")):
+    for motion, why in ((slid, SEEN_THROUGH), (np.eye(4), "")):
         found = Registration(motion, np.eye(6), 0.7, 0.01, 900, 5, True)
-        wanted = Candidate(0, 2, motion)
-        assert assessed(recipe, graph, clouds, frames, poses, wanted, found).rejected == why
+        assert assessed(recipe, graph, clouds, poses, Candidate(0, 2, motion), found).rejected == why
 
 
 def test_depth_beside_a_model_is_tested_by_free_space_too(clouds: CloudSet, registered: Edges) -> None:
-    results = iter([(clouds, ()), registered])
-    steps: Any = SimpleNamespace(step=lambda *_, **__: next(results), remember=lambda *_: None, key=lambda _: "")
-    names = tuple("abc")
+    results, asked = iter([(clouds, ()), registered]), list[dict[str, Any]]()
+
+    def step(*_: Any, **resources: Any) -> Any:
+        asked.append(resources)
+        return next(results)
+
+    steps: Any = SimpleNamespace(step=step, remember=lambda *_: None, key=lambda _: "")
+    eye, rows = np.eye(4), range(3)
+    frames = [Frame(row, float(row), CAMERA, read_depth=lambda: np.zeros((1, 1)), world_from_cam=eye) for row in rows]
     model: Any = SimpleNamespace(
-        frames=_frames(), body_of_frame=np.arange(3), body_from_cam=np.tile(np.eye(4), (3, 1, 1)), body_names=names
+        frames=frames, body_of_frame=np.arange(3), body_from_cam=np.tile(eye, (3, 1, 1)), body_names=tuple("abc")
     )
     options: Any = SimpleNamespace(
         edges=SimpleNamespace(propose=lambda *_: Edges.of(PAIRS)),
@@ -135,5 +166,6 @@ def test_depth_beside_a_model_is_tested_by_free_space_too(clouds: CloudSet, regi
         acceptance=Acceptance(min_spread=0.0),
     )
     found = depth_edges(model, options, steps, SimpleNamespace())
+    assert asked[1]["by_free_space"]
     assert found.graph.edges.tolist() == [PAIRS[0], PAIRS[2]]
     assert found.notes == (f"1 pair with depth left out: {SEEN_THROUGH}",)

@@ -12,7 +12,6 @@ from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.registration.cloud_set import prepare_clouds
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.register import register_edges
-from hodge_pipeline.registration.seen_through import depth_cameras, seen_through
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.store.codec import CLOUDS
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, ViewGraph
@@ -58,9 +57,10 @@ def depth_edges(model: TrackedModel, options: ModelRefinement, steps: Steps, wor
     held = held_out(len(pairs), PAIRS_HELD_OUT, options.seed)
     chosen = Edges.of(pairs[~held], "depth")
     registered = steps.step(
-        register_edges, chosen, clouds, options.registration, poses, title="registration", workers=workers
-    )
-    reasons = options.acceptance.reasons(registered, through=seen_through(registered, clouds, depth_cameras(frames)))
+        register_edges, chosen, clouds, options.registration, poses, by_free_space=options.acceptance.by_free_space,
+        title="registration", workers=workers,
+    )  # fmt: skip
+    reasons = options.acceptance.reasons(registered)
     notes = (
         *notes,
         *(f"{counted((reasons == why).sum(), 'pair')} with depth left out: {why}" for why in np.unique(reasons) if why),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
@@ -11,9 +9,10 @@ from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.registration.assessment import MOST_VIOLATION, SAME_FITNESS
 from hodge_pipeline.registration.odometry_path import contradicts_odometry, without_slides
+from hodge_pipeline.registration.seen_through import is_refuted
 from hodge_pipeline.registration.sliding import consecutive, weak_directions
 from hodge_pipeline.scene import Drift
-from hodge_pipeline.types import Edges, Floats, Ints
+from hodge_pipeline.types import Edges, Ints
 from hodge_pipeline.types.edges import HELD_OUT, REGISTERED, REJECTED, USED
 
 CONTRADICTS, SEEN_THROUGH = "contradicts odometry", "one camera saw through the other's surface"
@@ -53,16 +52,20 @@ class Acceptance:
         "as for landmarks, which do not slide, while what a rolling shutter bends may seem seen through",
     )
 
-    def reasons(self, registered: Edges, in_order: bool = True, through: Floats | None = None) -> NDArray[np.str_]:
+    @property
+    def by_free_space(self) -> bool:
+        """Whether registered pairs need `seen_through`."""
+        return self.max_seen_through is not None
+
+    def reasons(self, registered: Edges, in_order: bool = True) -> NDArray[np.str_]:
         """Why each pair (P,) is rejected by itself, an empty word where it is accepted.
 
-        Steps of frames that are `in_order` may slide: they stay at their guess. `through (P,)`: see `seen_through`.
+        Steps of frames that are `in_order` may slide: they stay at their guess.
         """
         out = np.full(len(registered.pairs), "", "U64")
         weak, _ = weak_directions(registered, self.min_spread)
         out[weak.any(axis=1) & ~(in_order & consecutive(registered))] = "what they share lets them slide"
-        if through is not None and self.max_seen_through is not None:
-            out[through > self.max_seen_through] = SEEN_THROUGH  # false for NaN
+        out[is_refuted(registered, self.max_seen_through)] = SEEN_THROUGH
         if self.max_rmse_m is not None:
             out[~(registered.rmse_m <= self.max_rmse_m)] = "points too far apart"
         out[~(registered.fitness >= self.min_fitness)] = "too little overlap"
@@ -70,23 +73,16 @@ class Acceptance:
         return out
 
 
-def accepted(
-    edges: Edges,
-    acceptance: Acceptance,
-    drift: Drift | None,
-    in_order: bool = True,
-    through: Callable[[Edges], Floats] | None = None,
-) -> tuple[Edges, Ints]:
+def accepted(edges: Edges, acceptance: Acceptance, drift: Drift | None, in_order: bool = True) -> tuple[Edges, Ints]:
     """The table with `status` (used or rejected) and `why` of every registered pair, and the rows (S,) to which an
     odometry step slid unnoticed, as the pairs across that step agree. Held-out pairs stay as they are.
 
     `drift`: odometry's poses and their covariance, None without odometry. `in_order`: whether consecutive rows are
-    steps of a path. `through` tells what of registered pairs the other camera saw through.
+    steps of a path.
     """
     rows = np.flatnonzero(edges.status != HELD_OUT)
     registered = edges.select(rows)
-    seen = None if through is None or acceptance.max_seen_through is None else through(registered)
-    reasons = acceptance.reasons(registered, in_order, seen)
+    reasons = acceptance.reasons(registered, in_order)
     slid = np.zeros(0, np.int64)
     if drift is not None:
         good = np.flatnonzero(reasons == "")

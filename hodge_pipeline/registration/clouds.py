@@ -122,7 +122,8 @@ def make_cloud(frame: Frame, options: CloudOptions) -> tuple[PointCloud, CloudCo
     """
     samples = _read_samples(frame, options)
     points, colours = voxel_means(samples.points_in_cam, samples.colours, options.voxel_m)
-    cloud, counts = PointCloud(points, _normals(points), colours, _landmarks(frame, options)), samples.counts
+    camera, counts = None if frame.read_depth is None else frame.camera, samples.counts
+    cloud = PointCloud(points, _normals(points), colours, _landmarks(frame, options), depth_camera=camera)
     if not len(points):
         odd = Oddity(frame.frame_id, "no valid measurement in range, its cloud is empty", samples.why_none)
         return cloud, counts._replace(odd=odd)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass as plain_dataclass
 from functools import partial
 from pathlib import Path
@@ -16,6 +16,7 @@ from hodge_pipeline.registration.assessment import MOST_VIOLATION
 from hodge_pipeline.registration.gaps import over_gap
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.pairs import prepared_clouds
+from hodge_pipeline.registration.seen_through import is_refuted, with_seen_through
 from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Registration
@@ -59,11 +60,11 @@ class OdometryOptions:
         "the step slid, and tracking is lost; null: any",
     )
 
-    def slid(self, registered: Edges, through: Callable[[Edges], Floats] | None) -> Bools:
-        """Where (P,) free space refutes a registration; nowhere without `max_seen_through`, or `through`."""
-        if through is None or self.max_seen_through is None:
-            return np.zeros(len(registered), bool)
-        return np.asarray(through(registered) > self.max_seen_through)  # false for NaN
+    def tested(self, registered: Edges, clouds: CloudSet, scale: float) -> tuple[Edges, Bools]:
+        """The table with what a camera saw through, and where (P,) that refutes it; as it is without a limit."""
+        if self.max_seen_through is not None:
+            registered = with_seen_through(registered, clouds, scale)
+        return registered, is_refuted(registered, self.max_seen_through)
 
 
 @plain_dataclass(frozen=True)
@@ -91,13 +92,13 @@ def odometry(
     options: OdometryOptions,
     workers: Workers,
     advance: Advance = no_progress,
-    through: Callable[[Edges], Floats] | None = None,
+    scale: float = 1.0,
 ) -> Odometry:
     """Poses of every frame; each sequence begins with the identity rotation, beside the sequence before it.
 
     Frames without points are bridged, and keep the pose of the frame before them. A block of steps starts two steps
     early to know its velocity, so that blocks run side by side and the result does not depend on the workers.
-    `advance` counts frames; `through` tells what of registered steps the other camera saw through.
+    `advance` counts frames; `scale` multiplies lengths that are for rooms.
     """
     clouds = CloudSet.open(folder)
     sizes = clouds.sizes
@@ -109,7 +110,8 @@ def odometry(
     steps = Edges.joined([results[number] for number in range(len(blocks))])
     gap = over_gap(steps.pairs, sequences, stamps_s)
     lost = ~(steps.fitness >= np.where(gap, max(SURE_FITNESS, options.min_fitness), options.min_fitness))
-    slid = ~lost & options.slid(steps, through)
+    steps, refuted = options.tested(steps, clouds, scale)
+    slid = ~lost & refuted
     poses = chained(len(sizes), sequences, steps, REACHES_APART * clouds.reach_m)
     notes = tuple(
         f"tracking was lost between rows {i} and {j} ({'a hole in the recording, ' if hole else ''}fitness "

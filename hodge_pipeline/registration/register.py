@@ -11,6 +11,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.pairs import register_pairs
+from hodge_pipeline.registration.seen_through import with_seen_through
 from hodge_pipeline.registration.sliding import HELD_SPREADS, held_where_sliding, weak_directions
 from hodge_pipeline.stages import Registrar, Step, Workers
 from hodge_pipeline.store import artifacts
@@ -30,6 +31,7 @@ def register_edges(
     scale: float = 1.0,
     min_spread: float = 0.0,
     earlier_from: Floats | None = None,
+    by_free_space: bool = False,
     *,
     workers: Workers,
     step: Step,
@@ -38,7 +40,8 @@ def register_edges(
 
     An `earlier` registration is kept where it needed no guess, where it is within `REUSE_WITHIN_M` of the guess from
     these poses, or, by GICP, where that guess is nearer to it than the earlier one, from `earlier_from (N, 4, 4)`:
-    GICP would converge to it again. `scale` multiplies lengths; `min_spread`: see `Acceptance`.
+    GICP would converge to it again. `scale` multiplies lengths; `min_spread`: see `Acceptance`; `by_free_space`:
+    whether what a camera saw through is told.
     """
     held_out = edges.status == HELD_OUT
     candidates = edges.select(~held_out)
@@ -60,8 +63,10 @@ def register_edges(
     if earlier is not None and len(rows):
         columns = {name: getattr(earlier, name)[known] for name in REGISTERED}
         kept = replace(kept, status=np.full(len(rows), USED), **columns)
-    order = np.argsort(np.concatenate([missing, rows]))
-    return Edges.joined([Edges.joined([found, kept]).select(order), edges.select(held_out)])
+    every = Edges.joined([found, kept]).select(np.argsort(np.concatenate([missing, rows])))
+    if by_free_space:
+        every = with_seen_through(every, clouds, scale)
+    return Edges.joined([every, edges.select(held_out)])
 
 
 def keep_block(folder: Path, block: int, result: Edges) -> None:

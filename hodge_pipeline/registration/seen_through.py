@@ -4,14 +4,17 @@ before or beside it where the other camera saw through.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hodge_pipeline.registration.global_evidence import DepthView, cloud_view, violation
-from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats
 from hodge_pipeline.types.arrays import evenly
+
+if TYPE_CHECKING:
+    from hodge_pipeline.registration.global_evidence import DepthView
 
 POINTS_PROJECTED = 1000
 """Of a cloud, at most: the standard error of a share of 0.15 is 1 %."""
@@ -19,27 +22,33 @@ VIEWS_KEPT = 256
 """Views in memory, 40 kB each with their points; pairs come sorted by their first cloud."""
 
 
-def depth_cameras(frames: Sequence[Frame]) -> tuple[Camera | None, ...]:
-    """The camera of each frame with a depth image, None of the others."""
-    return tuple(None if frame.read_depth is None else frame.camera for frame in frames)
-
-
-def seen_through(registered: Edges, clouds: CloudSet, cameras: Sequence[Camera | None], scale: float = 1.0) -> Floats:
-    """The share (P,) of the points in view that the other camera of a pair saw through, the larger of both ways; NaN
-    where a frame has no depth image, or they have too little in view of each other.
+def with_seen_through(registered: Edges, clouds: CloudSet, scale: float = 1.0) -> Edges:
+    """The table with the share (P,) of the points in view that the other camera of a pair saw through, the larger of
+    both ways; NaN where a cloud is of no depth image, or they have too little in view of each other.
 
     `scale` multiplies lengths that are for rooms.
     """
+    from hodge_pipeline.registration.global_evidence import cloud_view, violation  # scipy, which workers do without
 
     @lru_cache(maxsize=VIEWS_KEPT)
-    def seen(row: int, camera: Camera) -> tuple[DepthView, Floats]:
-        points = np.asarray(clouds[row].points_in_cam, float)
-        return cloud_view(points, camera, scale), points[evenly(len(points), POINTS_PROJECTED)]
+    def seen(row: int) -> tuple[DepthView, Floats] | None:
+        cloud = clouds[row]
+        if cloud.depth_camera is None:
+            return None
+        points = np.asarray(cloud.points_in_cam, float)
+        return cloud_view(points, cloud.depth_camera, scale), points[evenly(len(points), POINTS_PROJECTED)]
 
     out = np.full(len(registered), np.nan)
-    for at, ((i, j), motion) in enumerate(zip(registered.pairs.tolist(), registered.i_from_j, strict=True)):
-        first, second = cameras[i], cameras[j]
-        if first is not None and second is not None and registered.correspondences[at]:
-            (view_i, points_i), (view_j, points_j) = seen(i, first), seen(j, second)
-            out[at] = violation((view_i, view_j), (points_i, points_j), motion, scale)
-    return out
+    for at in np.flatnonzero(registered.correspondences).tolist():
+        first, second = map(seen, registered.pairs[at].tolist())
+        if first is not None and second is not None:
+            (view_i, points_i), (view_j, points_j) = first, second
+            out[at] = violation((view_i, view_j), (points_i, points_j), registered.i_from_j[at], scale)
+    return replace(registered, seen_through=out)
+
+
+def is_refuted(registered: Edges, most: float | None) -> Bools:
+    """Where (P,) a camera saw through more than the share `most`; nowhere without a limit."""
+    if most is None:
+        return np.zeros(len(registered), bool)
+    return np.asarray(registered.seen_through > most)  # false for NaN

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,8 +10,8 @@ from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation.residuals import edge_residuals
 from hodge_pipeline.recipe.schema import Recipe
-from hodge_pipeline.registration.seen_through import depth_cameras, seen_through
-from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Registration, ViewGraph
+from hodge_pipeline.registration.seen_through import with_seen_through
+from hodge_pipeline.types import CloudSet, Edges, Floats, Registration, ViewGraph
 
 LEAST_POINTS = 3
 """Point pairs that fix a rigid motion."""
@@ -89,22 +88,18 @@ def assessed(
     recipe: Recipe,
     graph: ViewGraph,
     clouds: CloudSet,
-    frames: Sequence[Frame],
     world_from_cam: Floats,
     wanted: Candidate,
     found: Registration,
 ) -> Candidate:
-    """The candidate with its registration, the acceptance's reason against it, and the residual at poses (V, 4, 4).
-
-    Without `frames`, as without their source, nothing tells which depth camera saw what.
-    """
+    """The candidate with its registration, the acceptance's reason against it, and the residual at poses (V, 4, 4)."""
     row = Edges.of([[wanted.i, wanted.j]]).with_registrations([found])
-    through = seen_through(row, clouds, depth_cameras(frames), float(recipe.scale)) if len(frames) else None
+    row = with_seen_through(row, clouds, float(recipe.scale))
     residual_m, residual_rad = edge_residuals(row.as_graph(graph.vertex_ids), world_from_cam)
     return replace(
         wanted,
         found=found,
-        rejected=str(recipe.acceptance.reasons(row, through=through)[0]),
+        rejected=str(recipe.acceptance.reasons(row)[0]),
         residual_m=float(residual_m[0]),
         residual_deg=float(np.degrees(residual_rad[0])),
     )

@@ -314,8 +314,7 @@ class Session:
         with self.changed:
             if self.candidate is wanted:
                 poses = self.settled.world_from_cam
-                graph, frames = self.table.graph, self.subject.frames
-                self.candidate = assessed(recipe, graph, clouds, frames, poses, wanted, found)
+                self.candidate = assessed(recipe, self.table.graph, clouds, poses, wanted, found)
             self.bump()
 
     def refresh(self) -> None:

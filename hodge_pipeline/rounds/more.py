@@ -11,6 +11,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.registration.global_pairs import describe_clouds, match_pairs
 from hodge_pipeline.registration.pairs import register_pairs
+from hodge_pipeline.registration.seen_through import with_seen_through
 from hodge_pipeline.rounds.one_round import Work
 from hodge_pipeline.stages import Registrar, Step, Workers
 from hodge_pipeline.start.unordered.hypotheses import weigh
@@ -54,7 +55,8 @@ def register_more(
     guesses = placed.guesses(pairs, guesses)
     return work.steps.step(
         register_named_pairs, pairs, guesses, proposed_by, work.scene.source, work.scene.clouds,
-        work.recipe.registration, matching if np.isnan(guesses).any() else None,
+        work.recipe.registration, matching if np.isnan(guesses).any() else None, work.scale,
+        work.recipe.acceptance.by_free_space,
         title=title, total=len(pairs), workers=work.workers,
     )  # fmt: skip
 
@@ -67,11 +69,16 @@ def register_named_pairs(
     clouds: CloudSet,
     registrar: Registrar,
     matching: GlobalStart | None,
+    scale: float,
+    by_free_space: bool,
     *,
     workers: Workers,
     step: Step,
 ) -> Edges:
-    """Step: these pairs registered from their guesses (P, 4, 4), with `matching` where these are NaN."""
+    """Step: these pairs registered from their guesses (P, 4, 4), with `matching` where these are NaN.
+
+    `scale` multiplies lengths that are for rooms; `by_free_space`: see `register_edges`.
+    """
     unknown = np.asarray(np.isnan(guesses).any(axis=(1, 2)))
     near, far = pairs[~unknown], pairs[unknown]
     found = [register_pairs(clouds.folder, registrar, Edges.of(near), guesses[~unknown], workers, step.advance)]
@@ -79,7 +86,8 @@ def register_named_pairs(
         scratch = step.folder / "scratch"
         found.append(_without_guess(far, source, clouds.folder, registrar, matching, scratch, workers, step))
         step.advance(len(far))
-    return Edges.joined(found).put(slice(None), proposed_by=proposed_by)
+    every = Edges.joined(found).put(slice(None), proposed_by=proposed_by)
+    return with_seen_through(every, clouds, scale) if by_free_space else every
 
 
 def _without_guess(

@@ -20,7 +20,6 @@ from hodge_pipeline.recipe.round_options import SolveWith
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.registration.acceptance import accepted, with_odometry
 from hodge_pipeline.registration.register import register_edges
-from hodge_pipeline.registration.seen_through import depth_cameras, seen_through
 from hodge_pipeline.scene import START, Round, Scene
 from hodge_pipeline.solvers.editing import GraphEditor
 from hodge_pipeline.solvers.positions import Fixes, Placed, place
@@ -112,6 +111,7 @@ class Work:
         registered = self.steps.step(
             register_edges, edges, self.scene.clouds, self.recipe.registration, world_from_cam, earlier, self.scale,
             self.recipe.acceptance.min_spread, before.before if number > 1 else None,
+            self.recipe.acceptance.by_free_space,
             title=f"registration, round {number}", total=int((edges.status != HELD_OUT).sum()), workers=self.workers,
         )  # fmt: skip
         fresh = np.flatnonzero(registered.status != HELD_OUT)
@@ -120,14 +120,10 @@ class Work:
 
     def accept(self, edges: Edges) -> Edges:
         """The table with the status of every registered pair, steps of odometry as in `with_odometry`."""
-        found, slid = accepted(edges, self.recipe.acceptance, self.scene.drift, self.scene.in_order, self._through)
+        found, slid = accepted(edges, self.recipe.acceptance, self.scene.drift, self.scene.in_order)
         if len(slid):
             self.steps.note(Note("slid", len(slid), in_runs(slid, self.scene.first.vertex_ids)))
         return found if self.scene.drift is None else with_odometry(found, self.scene.first.edges)
-
-    def _through(self, registered: Edges) -> Floats:
-        """What of each registered pair the other camera saw through."""
-        return seen_through(registered, self.scene.clouds, depth_cameras(self.scene.source.frames), self.scale)
 
     @property
     def scale(self) -> float:

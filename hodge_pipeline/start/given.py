@@ -16,7 +16,6 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.trajectory import associate
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import OdometryOptions
-from hodge_pipeline.registration.seen_through import depth_cameras
 from hodge_pipeline.scene import (
     START,
     GivenFile,
@@ -159,7 +158,7 @@ class GivenStart:
         places = tuple(np.arange(start, end) for start, end in pairwise(ends))
         title = "poses between the given ones"
         found = steps.step(
-            chain, made, places, stamps, depth_cameras(part.frames), clouds.unit_m, self.odometry,
+            chain, made, places, stamps, clouds.unit_m, self.odometry,
             title=title, total=len(rows), workers=workers,
         )  # fmt: skip
         poses = given.copy()

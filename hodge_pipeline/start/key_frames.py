@@ -17,7 +17,6 @@ from hodge_pipeline.registration.cloud_set import no_clouds
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.gaps import told_gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chained
-from hodge_pipeline.registration.seen_through import depth_cameras, seen_through
 from hodge_pipeline.registration.tracking.blocks import BlockRows, TrackedBlocks
 from hodge_pipeline.registration.tracking.bridging import bridge
 from hodge_pipeline.registration.tracking.focal import estimate_focal
@@ -179,9 +178,7 @@ def track(source: Source, options: TrackingOptions, *, workers: Workers, step: S
     edges = replace(edges, pairs=_renumbered(edges.pairs, key_of_row))
     key_sequences = [np.flatnonzero(np.isin(key_rows, rows)) for rows in sequences]
     poses = chained(len(key_rows), key_sequences, edges, REACHES_APART * clouds.reach_m)
-    cameras = depth_cameras([source.frames[row] for row in key_rows])
-    through = partial(seen_through, clouds=clouds, cameras=cameras, scale=options.clouds.unit_m)
-    held, poses = bridge(folder / CLOUDS, key_sequences, edges, poses, options.odometry, workers, through)
+    held, poses = bridge(clouds, key_sequences, edges, poses, options.odometry, workers, options.clouds.unit_m)
     sightings = folder / "sightings"
     sightings.mkdir(exist_ok=True)
     blocks.keep_sightings(sightings)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -15,7 +14,6 @@ from hodge_pipeline.pairs.revisits import Revisits, find_revisits
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import Odometry, OdometryOptions, odometry
 from hodge_pipeline.registration.odometry_path import drift_of
-from hodge_pipeline.registration.seen_through import depth_cameras, seen_through
 from hodge_pipeline.scene import START, Closed, KeyFrames, Round, Scene, key_source, sequences_of, vertex_ids
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import Step, Steps, Workers
@@ -24,7 +22,7 @@ from hodge_pipeline.start.unordered.join import join_parts
 from hodge_pipeline.start.unordered.loops import find_loops, is_long
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.start.unordered.start import uses_images
-from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Ints, Source
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Source
 from hodge_pipeline.types.notes import Note, notes_of
 
 OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
@@ -58,7 +56,7 @@ class OdometryStart(OdometryOptions):
         stamps = np.array([frame.stamp_s for frame in source.frames])
         made = make_clouds(source, clouds, steps, workers)
         found = steps.step(
-            chain, made, sequences, stamps, depth_cameras(source.frames), clouds.unit_m, self.odometry,
+            chain, made, sequences, stamps, clouds.unit_m, self.odometry,
             title="odometry", total=len(stamps), workers=workers,
         )  # fmt: skip
         key_frames = KeyFrames.all_of(source, found.world_from_cam)
@@ -121,17 +119,15 @@ def chain(
     clouds: CloudSet,
     sequences: tuple[Ints, ...],
     stamps_s: Floats,
-    cameras: tuple[Camera | None, ...],
     scale: float,
     options: OdometryOptions,
     *,
     workers: Workers,
     step: Step,
 ) -> Odometry:
-    """Step: poses of all frames by `registration.odometry`, without the steps that free space refutes; `cameras` are
-    those of depth images, `scale` multiplies lengths that are for rooms.
+    """Step: poses of all frames by `registration.odometry`, without the steps that free space refutes; `scale`
+    multiplies lengths that are for rooms.
     """
-    through = partial(seen_through, clouds=clouds, cameras=cameras, scale=scale)
-    found = odometry(clouds.folder, sequences, stamps_s, options, workers, step.advance, through)
+    found = odometry(clouds.folder, sequences, stamps_s, options, workers, step.advance, scale)
     step.note(*notes_of("start", found.notes))
     return found

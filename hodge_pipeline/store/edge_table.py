@@ -25,6 +25,7 @@ COLUMNS = {
     "overlap": "overlap",
     "fitness": "fitness",
     "rmse_m": "rmse_m",
+    "seen_through": "seen_through",
     "correspondences": "correspondences",
     "weight": "weight",
     "residual_m": "residual_m",

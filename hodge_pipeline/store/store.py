@@ -32,7 +32,7 @@ from hodge_pipeline.types.notes import Note
 
 T = TypeVar("T")
 LIBRARIES = ("hodge-pipeline", "numpy", "scipy", "open3d", "small_gicp", "opencv-python-headless", "pycolmap")
-LAYOUT = 3
+LAYOUT = 4
 """Version of the format of stored steps: raise it when the format changes, so that older ones are computed again."""
 RECORD, KEY, INDEX = "step.json", "key.txt", "index.json"
 """Files: record of a finished step (key, hash of each file, notes, cost); key of a begun one; list of a run's steps."""

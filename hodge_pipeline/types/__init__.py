@@ -15,6 +15,7 @@ from hodge_pipeline.types.arrays import Floats as Floats
 from hodge_pipeline.types.arrays import Floats32 as Floats32
 from hodge_pipeline.types.arrays import Ints as Ints
 from hodge_pipeline.types.arrays import Words as Words
+from hodge_pipeline.types.camera import Camera as Camera
 from hodge_pipeline.types.clouds import CloudSet as CloudSet
 from hodge_pipeline.types.clouds import Landmarks as Landmarks
 from hodge_pipeline.types.clouds import PointCloud as PointCloud
@@ -28,28 +29,6 @@ from hodge_pipeline.types.text import counted
 
 LEAST_WEIGHT = 1e-3
 """Weight of an edge, relative to its own information, above which it counts."""
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A pinhole camera: `u = fx x / z + cx`, `v = fy y / z + cy`, in pixels; `fy` is negative where y points up.
-
-    The centre of the first pixel is (0, 0). `readout_s`: seconds from reading the first row to the last (rolling
-    shutter); 0: all at once.
-    """
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    readout_s: float = 0.0
-
-    @property
-    def matrix(self) -> Floats:
-        """The 3x3 intrinsic matrix K, `(u, v, 1) ~ K p_cam`."""
-        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)

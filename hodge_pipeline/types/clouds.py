@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.types.arrays import Bytes, Floats32, Ints
+from hodge_pipeline.types.arrays import Bytes, Floats, Floats32, Ints
+from hodge_pipeline.types.camera import Camera, camera_numbers, camera_of
 
 CLOUDS_AT_ONCE = 64
 """Clouds read before their memory is given back: 4 to 15 MB."""
@@ -48,6 +49,7 @@ class PointCloud:
     - `times_s (N,)`: when a scanner measured each point, seconds after the first; None where unknown.
     - `first_s`: the time of the first point as the sensor counts it, by a clock or after the frame's stamp.
     - `no_numbers`: how many points the reader left out, since their coordinates are no numbers.
+    - `depth_camera`: that of the depth image that the points come from; None of a scan.
     """
 
     points_in_cam: Floats32
@@ -57,6 +59,7 @@ class PointCloud:
     times_s: Floats32 | None = None
     first_s: float = 0.0
     no_numbers: int = 0
+    depth_camera: Camera | None = None
 
     def __len__(self) -> int:
         return len(self.points_in_cam)
@@ -66,11 +69,12 @@ class CloudSet(Sequence[PointCloud]):
     """The down-sampled cloud of every frame, as memory-mapped columns: opening one costs no copy.
 
     `offsets (N + 1,)` cut `points (P, 3)`, `normals (P, 3)`, `colours (P, 3)` into frames; an empty slice is a frame
-    without a valid measurement. `marks (N + 1,)` cut the landmarks' `mark_points (Q, 3)`, `mark_descriptors (Q, 128)`
+    without a valid measurement. `cameras (N, 6)` are those of their depth images, as `camera_numbers`.
+    `marks (N + 1,)` cut the landmarks' `mark_points (Q, 3)`, `mark_descriptors (Q, 128)`
     and `mark_pixel_rad (Q,)` likewise. `stored_in` is the folder of the columns; None of what is in memory.
     """
 
-    OF_POINTS = ("offsets", "points", "normals", "colours")
+    OF_POINTS = ("offsets", "points", "normals", "colours", "cameras")
     FILES = (*OF_POINTS, "marks", "mark_points", "mark_descriptors", "mark_pixel_rad")
 
     def __init__(
@@ -79,6 +83,7 @@ class CloudSet(Sequence[PointCloud]):
         points: Floats32,
         normals: Floats32,
         colours: Bytes,
+        cameras: Floats,
         marks: Ints,
         mark_points: Floats32,
         mark_descriptors: Bytes,
@@ -87,6 +92,7 @@ class CloudSet(Sequence[PointCloud]):
     ) -> None:
         self.stored_in, self._reads = folder, 0
         self.offsets, self.points, self.normals, self.colours = offsets, points, normals, colours
+        self.cameras = cameras
         self.marks, self.mark_points, self.mark_descriptors = marks, mark_points, mark_descriptors
         self.mark_pixel_rad = mark_pixel_rad
 
@@ -123,6 +129,7 @@ class CloudSet(Sequence[PointCloud]):
             np.concatenate([empty, *(c.points_in_cam for c in clouds)]).astype(np.float32),
             np.concatenate([empty, *normals]).astype(np.float32),
             np.concatenate([empty, *colours]).astype(np.uint8),
+            np.array([camera_numbers(c.depth_camera) for c in clouds], float).reshape(-1, 6),
             _offsets([len(one) for one in landmarks]),
             np.concatenate([empty, *(one.points_in_cam for one in landmarks)]).astype(np.float32),
             np.concatenate([Landmarks.none().descriptors, *(one.descriptors for one in landmarks)]),
@@ -150,7 +157,8 @@ class CloudSet(Sequence[PointCloud]):
         cut = slice(int(self.offsets[row]), int(self.offsets[row + 1]))
         own = slice(int(self.marks[row]), int(self.marks[row + 1]))
         landmarks = Landmarks(self.mark_points[own], self.mark_descriptors[own], self.mark_pixel_rad[own])
-        return PointCloud(self.points[cut], self.normals[cut], self.colours[cut], landmarks)
+        points, normals, colours = self.points[cut], self.normals[cut], self.colours[cut]
+        return PointCloud(points, normals, colours, landmarks, depth_camera=camera_of(self.cameras[row]))
 
     def read(self, rows: Iterable[int]) -> Iterator[PointCloud]:
         """The clouds of these rows one after another."""

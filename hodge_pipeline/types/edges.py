@@ -148,7 +148,8 @@ class Edges:
       ones are legal. `proposed_by (E,)`: the reasons, joined by "+", or the format that a measured edge comes from.
       `overlap (E,)`: the score of the proposal in [0, 1].
     - Registered: `i_from_j`, `information`, `fitness`, `rmse_m`, `correspondences` as in `ViewGraph`, `iterations`, and
-      whether it `converged`.
+      whether it `converged`. `seen_through (E,)`: the share of the points in view that the other depth camera saw
+      through.
     - Accepted: `status (E,)`, one of the six words; `why (E,)`: the reason of a rejection, later of the verdict.
     - Solved: `weight (E,)` relative to its own information, `residual_m`, `residual_rad (E,)` under the poses.
     - Judged: `verdict (E,)`; `probability (E,)` that it is right, NaN where untestable; `leverage (E,)`: its share in
@@ -162,6 +163,7 @@ class Edges:
     information: Floats
     fitness: Floats
     rmse_m: Floats
+    seen_through: Floats
     correspondences: Ints
     iterations: Ints
     converged: Bools
@@ -197,6 +199,7 @@ class Edges:
             information=np.broadcast_to(nothing, (count, 6, 6)),
             fitness=number,
             rmse_m=number,
+            seen_through=number,
             correspondences=whole,
             iterations=whole,
             converged=np.zeros(count, bool),
@@ -286,5 +289,5 @@ class Edges:
 
 MEASURED = ("i_from_j", "information", "fitness", "rmse_m", "correspondences")
 """The columns that `Edges` and `ViewGraph` have in common."""
-REGISTERED = (*MEASURED, "iterations", "converged")
+REGISTERED = (*MEASURED, "seen_through", "iterations", "converged")
 """The columns of what a registrar finds."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,26 +10,26 @@ from hodge_pipeline import se3
 from hodge_pipeline.registration.odometry import OdometryOptions
 from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.stages import Workers
-from hodge_pipeline.types import Edges, Floats, Ints
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
 
 REACH = 3
 """Key frames on either side of a break."""
 
 
 def bridge(
-    clouds: Path,
+    clouds: CloudSet,
     sequences: Sequence[Ints],
     steps: Edges,
     poses: Floats,
     options: OdometryOptions,
     workers: Workers,
-    through: Callable[[Edges], Floats],
+    scale: float,
 ) -> tuple[Edges, Floats]:
     """The good steps and the bridges found, and the poses (K, 4, 4) of the K key frames with the bridges applied.
 
     A step with a fitness below `options.min_fitness` is a break; its bridge is the fittest registration between one of
-    the three key frames before it and one of the three after it that free space does not refute: `through` tells what
-    of registered pairs the other camera saw through.
+    the three key frames before it and one of the three after it that free space does not refute; `scale` multiplies
+    lengths that are for rooms.
     """
     good = steps.fitness >= options.min_fitness
     breaks = steps.pairs[~good]
@@ -39,8 +38,9 @@ def bridge(
     pairs = np.concatenate([_across(pair, rows) for rows in sequences for pair in breaks if np.isin(pair, rows).all()])
     pairs = np.unique(pairs, axis=0)
     guesses = se3.between(poses, pairs)
-    found = register_pairs(clouds, options.registration, Edges.of(pairs, "sequential"), guesses, workers)
-    holds = (found.fitness >= options.min_fitness) & ~options.slid(found, through)
+    found = register_pairs(clouds.folder, options.registration, Edges.of(pairs, "sequential"), guesses, workers)
+    found, refuted = options.tested(found, clouds, scale)
+    holds = (found.fitness >= options.min_fitness) & ~refuted
     bridges, moved = [], poses.copy()
     for i, j in breaks.tolist():
         over = np.flatnonzero((found.pairs[:, 0] <= i) & (found.pairs[:, 1] >= j) & holds)
