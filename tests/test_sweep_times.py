@@ -129,14 +129,26 @@ def test_a_turn_from_the_first_sweep_on_is_followed() -> None:
     assert absolute_error(found.world_from_scan, exact).max_m < NEAR_M
 
 
-def test_times_that_run_backwards_or_are_of_deskewed_points_are_told_by_the_points_on_the_map() -> None:
+def test_times_that_run_backwards_or_are_of_deskewed_points_are_told_by_the_points_on_the_map(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    placed = list[float]()
+    place = scan_to_map.ScanToMap.place
+
+    def counted(tracker: scan_to_map.ScanToMap, cloud: PointCloud, time_s: float) -> scan_to_map.Step:
+        placed.append(time_s)
+        return place(tracker, cloud, time_s)
+
+    monkeypatch.setattr(scan_to_map.ScanToMap, "place", counted)
     scanner = SpinningScanner(Road(20.0), 0, beams=16, columns=360, noise=1.0)
     right = [PointCloud(sweep.points, times_s=sweep.times_s) for sweep in map(scanner.sweep, range(12))]
     velocity = np.array([0, 0, 0, 20.0, 0, 0])
     flat = [replace(cloud, points_in_cam=deskewed(cloud, velocity).points_in_cam) for cloud in right]
     for clouds, sense in ((right, FORWARDS), ([turned(cloud) for cloud in right], BACKWARDS), (flat, UNUSED)):
         given = [(row, row * REVOLUTION_S, cloud) for row, cloud in enumerate(clouds)]
+        placed.clear()
         assert scan_to_map.sense_of_times(0.5, velocity, FORWARDS, given) == sense
+        assert (len(placed) < 2 * len(given)) == (clouds is right)  # no more are asked once they are surely worse
         if clouds is right:  # as of times by the order of points
             assert scan_to_map.sense_of_times(0.5, velocity, UNUSED, given) == sense
 

@@ -59,6 +59,10 @@ SURE, FEWEST_TIMED = 4.0, 10
 before these are taken. Times by the order of points reach 9.5 in 28 simulated sequences as measured, 0.2 in the same
 deskewed before.
 """
+WORSE = 2.0
+"""Standard errors by which fewer points lie on the map by other times than those told before no more sweeps are asked:
+sweeps that wrong times blur take longest. Of 88 judgements of simulated and real sequences it changes none.
+"""
 MOST_DESKEWS, FARTHER = 3, 0.9
 """A sweep is deskewed again while its new velocity moves its farther points, at this quantile, by half a voxel."""
 
@@ -230,25 +234,39 @@ def sense_of_times(voxel_m: float, velocity: Floats, told: int, sweeps: Sequence
     if len(sweeps) < FEWEST_TIMED:
         return told
 
-    def on_map(sense: int) -> Floats:
-        return _shares(voxel_m, velocity, [(row, at, retimed(cloud, 0.0, sense)) for row, at, cloud in sweeps])
+    def on_map(sense: int) -> Iterator[float]:
+        return _shares(voxel_m, velocity, ((row, at, retimed(cloud, 0.0, sense)) for row, at, cloud in sweeps))
 
     nearest = UNUSED if told == FORWARDS else FORWARDS
-    shares = {told: on_map(told), nearest: on_map(nearest)}
-    if np.nanmean(shares[nearest] - shares[told]) > 0:  # else what skews points the other way fits less still
-        shares[BACKWARDS] = on_map(BACKWARDS)
+    shares: dict[int, list[float]] = {told: [], nearest: []}
+    for of_told, of_nearest in zip(on_map(told), on_map(nearest), strict=True):
+        shares[told].append(of_told)
+        shares[nearest].append(of_nearest)
+        if _gain(shares[nearest], shares[told])[1] < -WORSE:
+            return told
+    if _gain(shares[nearest], shares[told])[0] > 0:  # else what skews points the other way fits less still
+        shares[BACKWARDS] = list(on_map(BACKWARDS))
     best = max(shares, key=lambda sense: float(np.nanmean(shares[sense])))
-    gain = shares[best] - shares[told]
-    return best if np.nanmean(gain) > SURE * np.nanstd(gain, ddof=1) / np.sqrt(len(gain)) else told
+    return best if _gain(shares[best], shares[told])[1] > SURE else told
 
 
-def _shares(voxel_m: float, velocity: Floats, sweeps: Sequence[tuple[int, float, PointCloud]]) -> Floats:
+def _gain(shares: list[float], of_told: list[float]) -> tuple[float, float]:
+    """Mean by which the shares of sweeps are greater, and this in its standard errors; 0 where too few tell."""
+    gain = np.subtract(shares, of_told)
+    gain = gain[np.isfinite(gain)]
+    if len(gain) < FEWEST_USUAL:
+        return 0.0, 0.0
+    mean = float(gain.mean())
+    return mean, mean / max(float(gain.std(ddof=1)) / np.sqrt(len(gain)), 1e-12)
+
+
+def _shares(voxel_m: float, velocity: Floats, sweeps: Iterable[tuple[int, float, PointCloud]]) -> Iterator[float]:
     """The share of points on the map of each sweep but the first two, which have no map of sweeps placed yet."""
-    tracker, shares = ScanToMap(voxel_m, velocity), list[float]()
-    for _, time_s, cloud in sweeps:
+    tracker = ScanToMap(voxel_m, velocity)
+    for number, (_, time_s, cloud) in enumerate(sweeps):
         tracker.accept(step := tracker.place(cloud, time_s))
-        shares.append(step.on_map)
-    return np.array(shares[2:])
+        if number >= 2:
+            yield step.on_map
 
 
 def _usual(shares: deque[float]) -> float:
