@@ -247,6 +247,15 @@ def test_a_sweep_that_fits_nothing_around_it_is_left_out_and_named(row: int) -> 
     assert absolute_error(found.world_from_scan[rows], true_poses(rows)).max_m < NEAR_M
 
 
+def test_the_first_two_sweeps_are_left_out_where_they_are_of_another_place() -> None:
+    frames = [*(changed(frame, mirrored) for frame in street()[:2]), *street()[2:]]
+    found, said = followed(frames)
+    assert (~found.found).nonzero()[0].tolist() == [0, 1]
+    assert "2 sweeps are left out" in said and "the first: 0.pcd: it fits none" in said
+    rows = np.flatnonzero(found.found)
+    assert absolute_error(found.world_from_scan[rows], true_poses(rows)).max_m < NEAR_M
+
+
 def test_key_frames_begin_and_end_with_sweeps_that_were_found() -> None:
     poses = np.tile(np.eye(4), (12, 1, 1))
     poses[:, 0, 3] = 0.4 * np.arange(12)
