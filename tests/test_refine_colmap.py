@@ -296,6 +296,22 @@ def test_poses_that_tracks_hardly_fix_are_set_beside_those_of_the_input(
     assert [name for name, _ in result.candidates][:4] == [GIVEN, POINTS, ADJUSTED, RESECTED]
 
 
+def test_an_adjustment_that_does_not_converge_is_set_beside_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = disturbed(noisy(tmp_path), tmp_path / "start")
+    usual = bundle._options
+
+    def few_steps(refine: bundle.Refine) -> pycolmap.BundleAdjustmentOptions:
+        options = usual(refine)
+        options.ceres.solver_options.max_num_iterations = 2
+        return options
+
+    monkeypatch.setattr(bundle, "_options", few_steps)
+    (result,) = hodge_pipeline.refine_colmap(start, database="none", overrides=FREE).results
+    assert result.candidates[-1][1].is_sound and ADJUSTED in [name for name, _ in result.candidates]
+
+
 def spoil(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every bundle adjustment from now on leaves the bodies anywhere."""
     honest = ColmapModel.adjusted

@@ -33,11 +33,14 @@ NO_EDGE_LEFT = "every edge was rejected: no two of them agree"
 
 @dataclass(frozen=True)
 class CandidateModel:
-    """A bundle-adjusted model, and how the report names the way it was made; `holds_poses`: it has the input's."""
+    """A bundle-adjusted model, and how the report names the way it was made; `holds_poses`: it has the input's;
+    `has_converged`: more steps of that adjustment would gain nothing.
+    """
 
     name: str
     model: TrackedModel
     holds_poses: bool = False
+    has_converged: bool = True
 
 
 @dataclass(frozen=True)
@@ -118,14 +121,15 @@ class _Candidates:
 
     @property
     def is_mended(self) -> bool:
-        """Whether the last candidate is sound and surely better than any points at the input's poses.
+        """Whether the last candidate is an optimum, sound, and surely better than any points at the input's poses.
 
         From a start as far off, other adjustments go on for hundreds of steps and end at the same optimum or a worse
-        one. Where the rays of the input's poses meet stands for the points that an adjustment of these alone would
-        find: both have as many observations beyond the cap.
+        one. Where its own did not converge, tracks fix poses so badly that others may end at a far better one. Where
+        the rays of the input's poses meet stands for the points that an adjustment of these alone would find: both have
+        as many observations beyond the cap.
         """
         last, model = self.costs[-1], self.candidates[-1].model
-        if len(self.costs) < 2 or not last.is_sound:
+        if len(self.costs) < 2 or not last.is_sound or not self.candidates[-1].has_converged:
             return False
         held = self._start.moved(self._start.world_from_body).quality
         _, before, after = costs(self._inputs, [held, model.quality])
@@ -156,7 +160,7 @@ class _Candidates:
             adjusted = in_frame_of(self._start, adjusted)
         self._steps.remember(adjusted, self._steps.key(found))
         at = len(self.candidates) if row is None else row
-        self.candidates.insert(at, CandidateModel(name, adjusted, holds_poses=not move_bodies))
+        self.candidates.insert(at, CandidateModel(name, adjusted, not move_bodies, found.has_converged))
         self.update_costs()
 
 
@@ -261,10 +265,11 @@ def measured_edges(model: TrackedModel, *, step: Step) -> tuple[ViewGraph, tuple
 
 @dataclass(frozen=True)
 class AdjustedModel:
-    """The folder of a model that bundle adjustment wrote, and its notes."""
+    """The folder of a model that bundle adjustment wrote, its notes, and whether the adjustment converged."""
 
     folder: Path
     notes: tuple[str, ...]
+    has_converged: bool
 
 
 def adjusted_model(
@@ -300,4 +305,4 @@ def _written(adjusted: TrackedModel, step: Step) -> AdjustedModel:
     folder = step.folder / MODEL
     folder.mkdir(exist_ok=True)
     adjusted.write(folder)
-    return AdjustedModel(folder, tuple(adjusted.notes))
+    return AdjustedModel(folder, tuple(adjusted.notes), adjusted.has_converged)

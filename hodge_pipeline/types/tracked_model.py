@@ -115,6 +115,10 @@ class TrackedModel(Protocol):
         Raises `SourceError` where it fails.
         """
 
+    @property
+    def has_converged(self) -> bool:
+        """False of an adjusted model whose adjustment ended by its limit of steps."""
+
     def with_robust_loss(self) -> TrackedModel:
         """The same model, whose adjustments let an observation that is far off pull little."""
         ...

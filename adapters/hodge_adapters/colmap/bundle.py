@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -29,6 +29,13 @@ WIDE = 1e8
 """Radius of the first trust region near an optimum: what COLMAP's own 1e4 grows to in eight good steps."""
 
 
+class Adjustment(NamedTuple):
+    """The points whose place is not adjusted to their whole track, and whether it ended before the limit of steps."""
+
+    loose: set[int]
+    converged: bool
+
+
 def adjust(
     reconstruction: pycolmap.Reconstruction,
     behind: Sequence[tuple[int, int]],
@@ -40,14 +47,14 @@ def adjust(
     robust: bool = False,
     roughly: bool = False,
     near_optimum: bool = False,
-) -> set[int]:
+) -> Adjustment:
     """Adjust it in place with COLMAP's own options; the points alone where bodies are not to move.
 
-    As in COLMAP, observations (image, keypoint) of points `behind` their camera take no part; gives the points whose
-    place is therefore not adjusted to their whole track. Without priors the gauge is that of two images; with them the
-    model keeps to theirs. `robust`: with a Cauchy loss of one pixel, for tracks that contradict each other.
-    `roughly`: to a step that gains less than `ROUGH` of the cost. `near_optimum`: with whole Gauss-Newton steps from
-    the first, of which few suffice there. Raises `SourceError` where the adjustment fails.
+    As in COLMAP, observations (image, keypoint) of points `behind` their camera take no part. Without priors the gauge
+    is that of two images; with them the model keeps to theirs. `robust`: with a Cauchy loss of one pixel, for tracks
+    that contradict each other. `roughly`: to a step that gains less than `ROUGH` of the cost. `near_optimum`: with
+    whole Gauss-Newton steps from the first, of which few suffice there. Raises `SourceError` where the adjustment
+    fails.
     """
     loose = {key for key, point in reconstruction.points3D.items() if point.track.length() < 2}
     is_whole = not loose and not behind
@@ -64,15 +71,15 @@ def adjust(
     if not part.num_points3D():
         raise SourceError("no point was seen by two images: nothing ties the poses: triangulate points first")
     options = _options(refine)
-    converged = CONVERGED if move_bodies else POINTS_CONVERGED
-    options.ceres.solver_options.function_tolerance = ROUGH if roughly else converged
+    least_gain = CONVERGED if move_bodies else POINTS_CONVERGED
+    options.ceres.solver_options.function_tolerance = ROUGH if roughly else least_gain
     if near_optimum:
         options.ceres.solver_options.initial_trust_region_radius = WIDE
     # far from the origin (UTM) and in large units it would stop early: its tolerances are absolute
     normal_from_world = part.normalize(fixed_scale=priors is not None)
     if priors is not None:
         priors = replace(priors, positions=priors.positions + normal_from_world.translation)
-    _solve(_adjuster(part, bodies, priors, move_bodies, options, robust))
+    converged = _solve(_adjuster(part, bodies, priors, move_bodies, options, robust))
     part.transform(normal_from_world.inverse())
     # what was held is bit for bit what it was
     for frame_id, pose in poses.items():
@@ -85,7 +92,7 @@ def adjust(
         points = reconstruction.points3D
         for key, point in part.points3D.items():
             points[key].xyz = point.xyz
-    return loose
+    return Adjustment(loose, converged)
 
 
 def _sensors_from_rigs(
@@ -165,10 +172,12 @@ def _pose_priors(
     return out
 
 
-def _solve(adjuster: pycolmap.BundleAdjuster) -> None:
+def _solve(adjuster: pycolmap.BundleAdjuster) -> bool:
+    """Whether it converged."""
     try:
         summary = adjuster.solve()
     except (ValueError, RuntimeError, IndexError) as error:  # what its C++ checks raise
         raise SourceError(f"bundle adjustment failed ({error}): does COLMAP itself open the model?") from error
     if not summary.is_solution_usable():
         raise SourceError(f"bundle adjustment failed ({summary.brief_report()}): the model's points do not fit it")
+    return bool(summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE)

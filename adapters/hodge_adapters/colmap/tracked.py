@@ -103,6 +103,8 @@ class ColmapModel:
     robust: bool = False
     roughly: bool = False
     known: PriorOptions = field(default_factory=PriorOptions)
+    has_converged: bool = True
+    """False of an adjusted model whose adjustment COLMAP's limit of steps ended."""
     placing: str = ""
     """What gave the model its place in the world, empty where nothing did."""
     tracks: Model | None = None
@@ -299,7 +301,7 @@ class ColmapModel:
     def _adjusted(self, priors: PositionPriors | None, move_bodies: bool, near_optimum: bool = False) -> ColmapModel:
         copy = self._copy()
         refine: Refine = self.refine if move_bodies else "none"
-        loose = adjust(
+        loose, converged = adjust(
             copy,
             self._behind(),
             self.bodies,
@@ -317,7 +319,7 @@ class ColmapModel:
                 if point_id in loose:
                     copy.points3D[point_id].xyz = xyz
         update_errors(copy)
-        return self._of(copy, self.records)
+        return self._of(copy, self.records, has_converged=converged)
 
     def with_robust_loss(self) -> ColmapModel:
         """The same model, whose adjustments let an observation that is far off pull little."""
@@ -375,7 +377,7 @@ class ColmapModel:
 
     def _of(self, reconstruction: pycolmap.Reconstruction, tracks: Model | None, **changes: Any) -> ColmapModel:
         """The same model of another reconstruction, with the tracks of this content; None: tracks that it has alone."""
-        known = {"files": (), "content": None, **changes}
+        known = {"files": (), "content": None, "has_converged": True, **changes}
         return replace(self, reconstruction=reconstruction, tracks=tracks, **known)
 
     def _of_content(self, reconstruction: pycolmap.Reconstruction, content: Model) -> ColmapModel:
