@@ -5,11 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.types import Bools, Floats
+from hodge_pipeline.types import Floats
 
-POLAR_STEPS = 12
-POLAR_TOLERANCE = 1e-8
-"""Of the last step: Newton's iteration squares it."""
 NEARLY_ROTATIONS = 1e-8
 """Off orthonormal: one step without an inverse mends it to rounding."""
 
@@ -60,25 +57,4 @@ def project(matrices: Floats) -> Floats:
     gram = matrices @ np.swapaxes(matrices, 1, 2)
     if np.abs(gram - np.eye(3)).max(initial=0.0) < NEARLY_ROTATIONS and (np.linalg.det(matrices) > 0).all():
         return np.asarray(1.5 * matrices - 0.5 * (gram @ matrices))
-    rotations, good = _polar(matrices)
-    if not good.all():
-        rotations[~good] = se3.project_to_so3(matrices[~good])
-    return rotations
-
-
-def _polar(matrices: Floats) -> tuple[Floats, Bools]:
-    """The orthogonal polar factors by Newton's iteration (Higham 1986), and where it may be trusted."""
-    x = matrices / np.maximum(np.linalg.norm(matrices, axis=(1, 2)), 1e-300)[:, None, None]
-    good = np.ones(len(x), bool)
-    for _ in range(POLAR_STEPS):
-        cofactor = np.stack([cross(x[:, 1], x[:, 2]), cross(x[:, 2], x[:, 0]), cross(x[:, 0], x[:, 1])], axis=1)
-        determinant = np.einsum("nk,nk->n", x[:, 0], cofactor[:, 0])
-        good &= determinant > 1e-9
-        inverse_transpose = cofactor / np.where(good, determinant, 1.0)[:, None, None]
-        scale = np.where(good, np.abs(determinant), 1.0)[:, None, None] ** (-1 / 3)
-        new = 0.5 * (scale * x + inverse_transpose / scale)
-        change = np.abs(new - x)[good].max(initial=0.0)
-        x = new
-        if change < POLAR_TOLERANCE:
-            break
-    return x, good
+    return se3.project_to_so3(matrices)
