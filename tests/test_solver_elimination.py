@@ -47,8 +47,6 @@ def test_it_solves_what_a_dense_solve_does(seed, size, shape):
     factor = factorise_blocks(plan, matrix)
     np.testing.assert_allclose(factor.solve(rhs), np.linalg.solve(dense, rhs), rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(factor.solve(rhs[:, 0]), factor.solve(rhs)[:, 0], rtol=1e-9, atol=1e-12)
-    loose = factorise_blocks(plan, matrix, single=True).solve(rhs)
-    assert np.linalg.norm(dense @ loose - rhs) < 0.05 * np.linalg.norm(rhs)
 
 
 def test_a_chain_leaves_next_to_nothing():

@@ -7,29 +7,21 @@ factorisation would be dear, the multilevel scheme (solvers/multilevel.py) takes
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import bsr_matrix
 
 from hodge_pipeline.complex.components import connected_components
-from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.cg import solved_columns
 from hodge_pipeline.solvers.direct import SECONDS_A_PRODUCT
-from hodge_pipeline.solvers.elimination import Elimination
 from hodge_pipeline.solvers.linear import factorise_blocks
 from hodge_pipeline.solvers.multilevel import RotationGraph, multilevel_rotations
 from hodge_pipeline.solvers.problem import Problem, make_problem, pinned_vertices
 from hodge_pipeline.solvers.rotations import project
 from hodge_pipeline.types import Floats
 
-LARGE = 60_000
-"""Unknowns above which the factor is kept in single precision."""
 MULTILEVEL_SECONDS_AN_EDGE = 2.5e-6
 """Where a factorisation takes longer, by the count of its products, the multilevel scheme takes its place."""
 AFFORDABLE_S, NOISY = 0.3, 0.1
 """So long a factorisation is worth it where the edges miss by more, as a mean square of 2 sin(θ/2) √2: 0.2 rad. Up to
 there both starts lead to the same minimum; with more noise the chordal one does so more often.
 """
-CG_TOLERANCE, MAX_CG_STEPS = 1e-5, 50
-"""Of refining a single-precision solution: a start need be no closer."""
 
 
 def initial_rotations(problem: Problem, pinned: Floats) -> Floats:
@@ -89,9 +81,8 @@ def chordal_rotations(problem: Problem, pinned: Floats) -> Floats:
     tail, head = tail[onto_pinned], head[onto_pinned]
     np.add.at(rhs, tail, weighted @ transposed[head])
     np.add.at(rhs, head, np.swapaxes(weighted, 1, 2) @ transposed[tail])
-    transposed[:free] = _solve(problem.structure.elimination, matrix, rhs[:free].reshape(free * d, d)).reshape(
-        free, d, d
-    )
+    factor = factorise_blocks(problem.structure.elimination, matrix)
+    transposed[:free] = factor.solve(rhs[:free].reshape(free * d, d)).reshape(free, d, d)
     out = np.empty_like(transposed)
     out[free:] = pinned
     out[:free] = project(np.swapaxes(transposed[:free], 1, 2))
@@ -104,14 +95,3 @@ def _blocks(problem: Problem, edges: slice) -> Floats:
     diagonal = kappa * np.eye(problem.dimension)
     forward = -kappa * problem.rotations[edges]
     return np.stack([diagonal, diagonal, forward, np.swapaxes(forward, 1, 2)])
-
-
-def _solve(plan: Elimination, matrix: bsr_matrix, rhs: Floats) -> Floats:
-    """The solution (n, d): of a large system by a single-precision factor and conjugate gradients, for its memory."""
-    if matrix.shape[0] < LARGE:
-        return factorise_blocks(plan, matrix).solve(rhs)
-    try:
-        factor = factorise_blocks(plan, matrix, single=True)
-    except GraphError:
-        return factorise_blocks(plan, matrix).solve(rhs)
-    return solved_columns(lambda x: np.asarray(matrix @ x), factor.solve, rhs, CG_TOLERANCE, MAX_CG_STEPS)

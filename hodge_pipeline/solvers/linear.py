@@ -37,36 +37,28 @@ class Factor:
         return np.asarray(self.solve_columns(np.asarray(rhs, float)))
 
 
-def factorise(matrix: csc_matrix | csr_matrix, ordering: str = "auto", single: bool = False) -> Factor:
+def factorise(matrix: csc_matrix | csr_matrix, ordering: str = "auto") -> Factor:
     """The factor of a symmetric positive definite matrix (n, n).
 
     `ordering` is a column permutation of SuperLU (`MMD_AT_PLUS_A`, `COLAMD`, `NATURAL`); `auto` is minimum degree on
-    A + Aᵀ, which keeps the fill of most graph Laplacians lowest. `single`: in float32, half the memory, good enough to
-    precondition with. Raises `GraphError` where the matrix is singular.
+    A + Aᵀ, which keeps the fill of most graph Laplacians lowest. Raises `GraphError` where the matrix is singular.
     """
-    csc = csc_matrix(matrix, dtype=np.float32 if single else np.float64, copy=False)
+    csc = csc_matrix(matrix, dtype=np.float64, copy=False)
     size = int(csc.shape[0])
     if size == 0:
         return Factor(0, lambda rhs: rhs)
-    factor = _decompose(csc, "MMD_AT_PLUS_A" if ordering == "auto" else ordering)
-    if single:
-        return Factor(size, lambda rhs: factor.solve(rhs.astype(np.float32)).astype(float))
-    return Factor(size, factor.solve)
+    return Factor(size, _decompose(csc, "MMD_AT_PLUS_A" if ordering == "auto" else ordering).solve)
 
 
-def factorise_blocks(plan: Elimination, matrix: bsr_matrix, single: bool = False) -> Factor:
+def factorise_blocks(plan: Elimination, matrix: bsr_matrix) -> Factor:
     """The factor of a symmetric positive definite block matrix (n · s, n · s) whose rows are in the plan's order.
 
-    `single`: in float32. Raises `GraphError` where the matrix is singular.
+    Raises `GraphError` where the matrix is singular.
     """
     if not plan.groups:
-        return factorise(by_columns(matrix), "NATURAL" if plan.ordered else "auto", single)
+        return factorise(by_columns(matrix), "NATURAL" if plan.ordered else "auto")
     try:
-        found = eliminate(
-            plan,
-            matrix.astype(np.float32 if single else np.float64, copy=False),
-            lambda left: factorise(left, "NATURAL", single).solve,
-        )
+        found = eliminate(plan, matrix, lambda left: factorise(left, "NATURAL").solve)
     except np.linalg.LinAlgError as error:
         raise GraphError(_singular(matrix.shape[0])) from error
     return Factor(int(matrix.shape[0]), found.solve)
