@@ -1,4 +1,4 @@
-"""Every linear back end gives the same minimum; `auto` takes the one that suits the graph."""
+"""Multigrid gives the minimum that a factorisation gives; a graph gets the one that suits it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.sparse import bsr_matrix, csr_matrix
 from hodge_pipeline import se3
 from hodge_pipeline.solvers import backends
 from hodge_pipeline.solvers import multigrid as multigrid_module
-from hodge_pipeline.solvers.backends import BackendName, choose, laplacian_factor
+from hodge_pipeline.solvers.backends import choose, laplacian_factor
 from hodge_pipeline.solvers.cg import truncated_cg
 from hodge_pipeline.solvers.covariance import marginal_covariances
 from hodge_pipeline.solvers.direct import factor_s
@@ -20,14 +20,6 @@ from hodge_pipeline.solvers.multigrid import Coarsening, Modes, aggregates, mult
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 from solver_graphs import laplacian
 from tests.backbone_graphs import drive
-
-NAMES: tuple[BackendName, ...] = ("superlu", "multigrid")
-
-
-@pytest.fixture(params=NAMES)
-def name(request: pytest.FixtureRequest) -> BackendName:
-    chosen: BackendName = request.param
-    return chosen
 
 
 def tube(count: int, ring: int = 20, sigma: float = 0.05, planar: bool = False) -> ViewGraph:
@@ -57,64 +49,67 @@ def grid(side: int) -> tuple[Ints, Ints, int]:
 
 @pytest.mark.parametrize("planar", [False, True])
 @pytest.mark.parametrize("objective", ["isotropic", "full"])
-def test_every_back_end_reaches_the_same_minimum(
-    name: BackendName, objective: str, planar: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(multigrid_module, "COARSEST", 100)
+def test_multigrid_reaches_the_same_minimum(objective: str, planar: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     graph = tube(800, planar=planar)
-    expected = solve(graph, objective=objective, backend="superlu", relative_tolerance=1e-12)  # type: ignore[arg-type]
-    found = solve(graph, objective=objective, backend=name, relative_tolerance=1e-12)  # type: ignore[arg-type]
+    expected = solve(graph, objective=objective, relative_tolerance=1e-12)  # type: ignore[arg-type]
+    monkeypatch.setattr(multigrid_module, "COARSEST", 100)
+    monkeypatch.setattr(backends, "ITERATIVE_FROM", 0)
+    found = solve(graph, objective=objective, relative_tolerance=1e-12)  # type: ignore[arg-type]
     assert found.metrics["objective"] == pytest.approx(expected.metrics["objective"], rel=1e-9)
     np.testing.assert_allclose(found.world_from_cam, expected.world_from_cam, atol=1e-4)
 
 
-def test_every_back_end_solves_a_laplacian(name: BackendName) -> None:
+def test_multigrid_solves_a_laplacian(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backends, "ITERATIVE_FROM", 0)
     tail, head, count = grid(70)
     weights = np.random.default_rng(0).uniform(0.5, 2.0, len(tail))
     rhs = np.random.default_rng(1).normal(size=(count, 3))
     matrix = laplacian(tail, head, weights, count)
     expected = factorise(matrix).solve(rhs)
-    found = laplacian_factor(matrix, choose(name, tail, head, count)[0]).solve(rhs)
+    chosen, _ = choose(tail, head, count)
+    assert chosen is not None
+    found = laplacian_factor(matrix, chosen).solve(rhs)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
 
 
-def test_a_tangled_graph_is_certified_and_given_covariances_without_an_order_of_its_own() -> None:
+def test_a_tangled_graph_is_factorised_for_its_certificate_and_covariances(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backends, "ITERATIVE_FROM", 300)
+    monkeypatch.setattr(backends, "_multigrid", lambda: pytest.fail("preconditioned"))
     graph = tube(400)
-    found = solve(graph, objective="isotropic", backend="multigrid", certificate=True)
+    found = solve(graph, objective="isotropic", certificate=True)
     assert found.certified is True
-    expected = marginal_covariances(graph, found.world_from_cam, np.array([200]))
-    assert np.isfinite(expected).all()
+    assert np.isfinite(marginal_covariances(graph, found.world_from_cam, np.array([200]))).all()
 
 
-def test_auto_factorises_what_is_small_or_like_a_chain_and_preconditions_what_is_tangled(
+def test_choice_factorises_what_is_small_or_like_a_chain_and_preconditions_what_is_tangled(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(backends, "ITERATIVE_FROM", 1000)
     tail, head, count = grid(40)
-    assert choose("auto", tail, head, count)[0] is not None
-    assert choose("auto", tail, head, count, direct=True)[0] is None
-    assert choose("auto", tail[:500], head[:500], 999)[0] is None
+    assert choose(tail, head, count)[0] is not None
+    assert choose(tail, head, count, direct=True)[0] is None
+    assert choose(tail[:500], head[:500], 999)[0] is None
     chain = np.arange(1600)
-    chosen, plan = choose("auto", chain[:-1], chain[1:], len(chain) - 1)
+    chosen, plan = choose(chain[:-1], chain[1:], len(chain) - 1)
     assert chosen is None
-    assert plan.ordered
+    assert np.isfinite(plan.work)
 
 
-def test_auto_takes_the_scalar_laplacians_of_a_town_though_its_joint_factor_costs_more_than_multigrid() -> None:
+def test_choice_takes_the_scalar_laplacians_of_a_town_though_its_joint_factor_costs_more_than_multigrid() -> None:
     graph = drive(world="town", dimension=3, count=30_000, loops=12_000, wrong=0.0).graph
     tail, head = graph.edges.T
-    chosen, plan = choose("auto", tail, head, graph.vertex_count - 1)
+    chosen, plan = choose(tail, head, graph.vertex_count - 1)
     assert chosen is None
     assert factor_s(plan, 6) > backends.SECONDS_A_BLOCK * (plan.size + 2 * len(tail))
 
 
-def test_auto_does_not_look_for_the_order_of_a_chain_tangled_by_loops_between_any_places() -> None:
+def test_choice_does_not_look_for_the_order_of_a_chain_tangled_by_loops_between_any_places() -> None:
     count, rng = 20_000, np.random.default_rng(0)
     steps = np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
     tail, head = np.concatenate([steps, rng.integers(0, count, (5_000, 2))]).T
-    chosen, plan = choose("auto", tail, head, count - 1)
+    chosen, plan = choose(tail, head, count - 1)
     assert chosen is not None
-    assert not plan.ordered
+    assert not np.isfinite(plan.work)
 
 
 def test_a_cycle_is_symmetric_and_positive_definite() -> None:

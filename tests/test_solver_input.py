@@ -248,7 +248,6 @@ def test_start_poses_and_priors_that_are_not_rigid_are_refused(matrix, fault):
     [
         ({"objective": "ful"}, r"objective 'ful' does not exist: take 'isotropic' or 'full'"),
         ({"initial": "odometry"}, r"initial 'odometry' does not exist: take 'chordal' or 'given'"),
-        ({"backend": "petsc"}, r"backend 'petsc' does not exist: take 'auto' or 'superlu' or "),
         ({"dimension": 4}, r"dimension 4 does not exist: take 2 or 3 or None"),
         ({"time_limit_s": float("nan")}, "time_limit_s is nan: expected seconds above zero"),
         ({"time_limit_s": -1.0}, "time_limit_s is -1: expected seconds above zero"),

@@ -7,7 +7,6 @@ its fill. (CHOLMOD was tried in SuperLU's place: after the block elimination it 
 from __future__ import annotations
 
 import math
-from typing import Literal, TypeAlias
 
 import numpy as np
 from scipy.sparse import csc_matrix, csr_matrix
@@ -20,7 +19,6 @@ from hodge_pipeline.solvers.linear import CHAIN_EDGES_PER_VERTEX, Factor, factor
 from hodge_pipeline.solvers.multigrid import Coarsening, Modes, Preconditioning, multigrid
 from hodge_pipeline.types import Floats, Ints
 
-BackendName: TypeAlias = Literal["auto", "superlu", "multigrid"]
 ITERATIVE_FROM = 15_000
 """Vertices: below, a factorisation and a hundred solves cost less than the hierarchies."""
 WIDEST = 20.0
@@ -37,17 +35,13 @@ SCALAR_TOLERANCE, MAX_SCALAR_STEPS = 1e-12, 300
 """Of conjugate gradients with one number to a vertex: as exact as a factorisation."""
 
 
-def choose(
-    name: BackendName, tail: Ints, head: Ints, count: int, direct: bool = False
-) -> tuple[Preconditioning | None, Elimination]:
+def choose(tail: Ints, head: Ints, count: int, direct: bool = False) -> tuple[Preconditioning | None, Elimination]:
     """What preconditions linear systems of a graph, None where they are factorised, and its plan of elimination.
 
-    Of edges (tail, head), those with an end at or past `count` lead to pinned vertices. `auto` is the cheaper of a
+    Of edges (tail, head), those with an end at or past `count` lead to pinned vertices. It is the cheaper of a
     factorisation, whose fill is foretold, and multigrid; where one will be needed (`direct`), it is a factorisation.
     """
-    if name == "multigrid":
-        return _multigrid(), unordered(count)
-    if name != "auto" or direct or count <= ITERATIVE_FROM:
+    if direct or count <= ITERATIVE_FROM:
         return None, plan_elimination(tail, head, count, fill_reducing_order)
     if len(tail) < CHAIN_EDGES_PER_VERTEX * count:
         plan = plan_elimination(tail, head, count, _order_of_narrow)

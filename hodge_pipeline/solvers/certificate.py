@@ -15,7 +15,7 @@ from scipy.sparse import bsr_matrix, csc_matrix, diags_array
 from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh
 
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.linear import Factor, definite_factor, fill_reducing_order, negative_pivots
+from hodge_pipeline.solvers.linear import Factor, definite_factor, negative_pivots
 from hodge_pipeline.solvers.problem import BlockPattern, Problem
 from hodge_pipeline.types import Floats, Ints
 
@@ -111,8 +111,7 @@ def certify(problem: Problem, rotations: Floats, translations: Floats, cost: flo
     d = problem.dimension
     scale = _scale(problem)
     rank = d * problem.count
-    order = elimination_order(problem)
-    matrix, on_rotations = _reduced(problem, order, certificate_matrix(problem, rotations, translations))
+    matrix, on_rotations = _reduced(problem, certificate_matrix(problem, rotations, translations))
     negative = -1
     for relative in RELATIVE_SHIFTS:
         shift = max(relative * scale, RELATIVE_GAP * cost / rank)
@@ -127,8 +126,7 @@ def certify(problem: Problem, rotations: Floats, translations: Floats, cost: flo
     smallest, vector = _smallest_eigenvalue(matrix, shift, on_rotations)
     direction = None
     if vector is not None:
-        direction = np.empty((problem.count, d))
-        direction[order] = vector.reshape(problem.count, d)
+        direction = vector.reshape(problem.count, d)
     note = f"not certified as the global minimum: {negative} negative eigenvalues, the smallest {smallest:.6g}"
     return Certificate(False, shift, np.inf, note, smallest, direction)
 
@@ -136,15 +134,6 @@ def certify(problem: Problem, rotations: Floats, translations: Floats, cost: flo
 def _scale(problem: Problem) -> float:
     """The median κ, 1 without edges: what shifts are relative to."""
     return float(np.median(problem.kappa)) if len(problem.kappa) else 1.0
-
-
-def elimination_order(problem: Problem) -> Ints:
-    """The vertices in an order that keeps the fill low; theirs, where they were put into one."""
-    order = np.arange(problem.count)
-    if not problem.structure.elimination.ordered:
-        free = problem.free_count
-        order[:free] = fill_reducing_order(problem.structure.laplacian(problem.kappa)).order
-    return order
 
 
 def lower_bound(
@@ -155,9 +144,7 @@ def lower_bound(
     `smallest_eigenvalue`: about that of Q − Λ there, NaN where it was not computed.
     For all R, F(R) ≥ tr Λ + λ_min(Q − Λ) · n d, and tr Λ is the cost. −∞ where there is no finite bound.
     """
-    matrix, on_rotations = _reduced(
-        problem, elimination_order(problem), certificate_matrix(problem, rotations, translations)
-    )
+    matrix, on_rotations = _reduced(problem, certificate_matrix(problem, rotations, translations))
     rank = problem.dimension * problem.count
     least = RELATIVE_GAP / GAP_STEP * cost
     gap = max(least, ABOVE * -smallest_eigenvalue * rank) if math.isfinite(smallest_eigenvalue) else least
@@ -181,15 +168,13 @@ def bounded(answer: Certificate, cost: float, bound: float) -> Certificate:
     return replace(answer, gap_bound=gap, note=note)
 
 
-def definite_inverse(
-    problem: Problem, order: Ints, connection: bsr_matrix, multiplier: Floats
-) -> Callable[[Floats], Floats]:
+def definite_inverse(problem: Problem, connection: bsr_matrix, multiplier: Floats) -> Callable[[Floats], Floats]:
     """The inverse of Q − Λ + s · I on vectors (n, d, r), s such that it is definite; its translations are eliminated.
 
-    `connection` is M, `multiplier (n, d, d)` Λ, `order (n,)` that of elimination.
+    `connection` is M, `multiplier (n, d, d)` Λ.
     """
-    d, rows = problem.dimension, _rows(problem, order)
-    matrix, on_rotations = _reduced(problem, order, _less(connection, multiplier))
+    d, rows = problem.dimension, _rows(problem)
+    matrix, on_rotations = _reduced(problem, _less(connection, multiplier))
     factor, _ = _definite(matrix, FIRST_SHIFT * _scale(problem), on_rotations)
 
     def apply(vectors: Floats) -> Floats:
@@ -215,17 +200,17 @@ def _definite(matrix: csc_matrix, shift: float, on_rotations: Floats) -> tuple[F
     raise GraphError(f"a linear system of {matrix.shape[0]} unknowns stays indefinite: check for contradictory weights")
 
 
-def _reduced(problem: Problem, order: Ints, matrix: bsr_matrix) -> tuple[csc_matrix, Floats]:
-    """The matrix in this order of vertices, and 1 at the rows of rotations."""
-    rows, size = _rows(problem, order), problem.dimension + 1
+def _reduced(problem: Problem, matrix: bsr_matrix) -> tuple[csc_matrix, Floats]:
+    """The matrix without pinned translations, and 1 at the rows of rotations."""
+    rows, size = _rows(problem), problem.dimension + 1
     return csc_matrix(csc_matrix(matrix)[rows][:, rows]), (rows % size < size - 1).astype(float)
 
 
-def _rows(problem: Problem, order: Ints) -> Ints:
-    """The rows of M, vertices in this order, without pinned translations."""
+def _rows(problem: Problem) -> Ints:
+    """The rows of M, in the order of elimination, without pinned translations."""
     size = problem.dimension + 1
-    rows = order[:, None] * size + np.arange(size)
-    return np.asarray(rows[(rows % size < size - 1) | (order < problem.free_count)[:, None]])
+    rows = np.arange(problem.count * size)
+    return rows[(rows % size < size - 1) | (rows < problem.free_count * size)]
 
 
 def _shifted(matrix: csc_matrix, shift: float, on_rotations: Floats) -> csc_matrix:

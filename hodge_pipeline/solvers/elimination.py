@@ -92,11 +92,6 @@ class Elimination:
     fill: float
 
     @property
-    def ordered(self) -> bool:
-        """Whether an order was looked for."""
-        return math.isfinite(self.work)
-
-    @property
     def size(self) -> int:
         """How many vertices there are."""
         return len(self.order)

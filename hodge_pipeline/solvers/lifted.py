@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import bsr_matrix
 
-from hodge_pipeline.solvers.certificate import connection_matrix, definite_inverse, elimination_order
+from hodge_pipeline.solvers.certificate import connection_matrix, definite_inverse
 from hodge_pipeline.solvers.cg import truncated_cg
 from hodge_pipeline.solvers.newton import Point, Step
 from hodge_pipeline.solvers.problem import Problem
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types import Floats
 
 MAX_CG_STEPS = 300
 MAX_HALVINGS = 30
@@ -44,12 +44,11 @@ class LiftedObjective:
 
     problem: Problem
     matrix: bsr_matrix
-    order: Ints
 
     @classmethod
     def of(cls, problem: Problem) -> LiftedObjective:
         """The lifted F of a problem."""
-        return cls(problem, connection_matrix(problem), elimination_order(problem))
+        return cls(problem, connection_matrix(problem))
 
     def at(self, rotations: Floats, translations: Floats) -> LiftedPoint:
         """The point at these frames (n, d, r); the translations follow from them, whatever was given."""
@@ -61,7 +60,7 @@ class LiftedObjective:
         assert isinstance(point, LiftedPoint)
         frames, multiplier = point.rotations, point.multiplier
         gradient = tangent(frames, point.image).reshape(-1)
-        inverse = definite_inverse(self.problem, self.order, self.matrix, multiplier)
+        inverse = definite_inverse(self.problem, self.matrix, multiplier)
 
         def hessian(x: Floats) -> Floats:
             along = x.reshape(frames.shape)

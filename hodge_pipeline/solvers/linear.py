@@ -56,7 +56,7 @@ def factorise_blocks(plan: Elimination, matrix: bsr_matrix) -> Factor:
     Raises `GraphError` where the matrix is singular.
     """
     if not plan.groups:
-        return factorise(by_columns(matrix), "NATURAL" if plan.ordered else "auto")
+        return factorise(by_columns(matrix), "NATURAL")
     try:
         found = eliminate(plan, matrix, lambda left: factorise(left, "NATURAL").solve)
     except np.linalg.LinAlgError as error:

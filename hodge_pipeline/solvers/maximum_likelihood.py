@@ -16,7 +16,6 @@ from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.one_blas_thread import one_blas_thread
-from hodge_pipeline.solvers.backends import BackendName
 from hodge_pipeline.solvers.certificate import Certificate, bounded, certify
 from hodge_pipeline.solvers.escape import escape
 from hodge_pipeline.solvers.minimise import Watch, at_start, metrics_of, minimise
@@ -39,7 +38,6 @@ def solve(
     start: Floats | None = None,
     objective: ObjectiveName = "full",
     initial: InitialName = "chordal",
-    backend: BackendName = "auto",
     dimension: Literal[2, 3] | None = None,
     fixed: Ints | None = None,
     priors: Priors | None = None,
@@ -56,8 +54,6 @@ def solve(
       indefinite information matrix is solved as isotropic, and a note says so.
     - `start (V, 4, 4)` sets the gauge of each component; with `initial="given"` the descent begins there, else at
       the chordal rotations, which need no start.
-    - `backend` of linear systems: `superlu` factorises, `multigrid` preconditions conjugate gradients, at a cost that
-      does not depend on the fill; `auto` takes what will be cheaper on this graph.
     - `dimension`: 2 for a graph in the plane; None takes the graph's, and 2 where every edge lies in the plane.
     - `fixed`: rows of vertices that stay at their start; None takes the graph's.
     - `priors`: unary pose priors; all poses that have one share the world's gauge. None takes the graph's.
@@ -76,7 +72,7 @@ def solve(
     if priors is not None and len(priors.vertices):
         (whole, start), fixed = with_world(graph, priors, start, fixed), None
     rows, unheld = held_rows(whole, start, fixed)
-    setup = prepare(whole, start, rows, dimension, backend, direct=certificate)
+    setup = prepare(whole, start, rows, dimension, direct=certificate)
     notes = [*unheld, *setup.weights.notes, *describe_components(setup.component, whole.vertex_ids)]
     if not setup.weights.used.any():
         notes.append(NO_EDGES)
@@ -157,11 +153,6 @@ class MaximumLikelihoodSolver:
         "chordal",
         description="chordal: rotations from a linear relaxation, whatever the start, so that drift cannot trap it; "
         "given: from the start, for warm calls where it is known to be good",
-    )
-    backend: BackendName = Field(
-        "auto",
-        description="of linear systems: superlu factorises; multigrid preconditions conjugate gradients, whatever the "
-        "fill; auto: what will be cheapest here",
     )
     tails: Literal["gaussian", "student"] = Field(
         "gaussian",

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
 
-from hodge_pipeline.solvers.backends import BackendName, choose, laplacian_factor
+from hodge_pipeline.solvers.backends import choose, laplacian_factor
 from hodge_pipeline.solvers.elimination import Elimination
 from hodge_pipeline.solvers.iterative import IterativeSolver
 from hodge_pipeline.solvers.linear import Factor
@@ -237,7 +237,6 @@ def make_problem(
     kappa: Floats,
     tau: Floats,
     pinned: Bools,
-    backend: BackendName = "auto",
     direct: bool = False,
 ) -> Problem:
     """The problem with its vertices in elimination order. `pinned (V,)` must hold one vertex or more of each
@@ -247,7 +246,7 @@ def make_problem(
     position = np.empty(len(pinned), np.int64)
     position[free], position[rest] = np.arange(len(free)), len(free) + np.arange(len(rest))
     tail, head = position[edges[:, 0]], position[edges[:, 1]]
-    chosen, elimination = choose(backend, tail, head, len(free), direct)
+    chosen, elimination = choose(tail, head, len(free), direct)
     order = np.concatenate([free[elimination.order], rest])
     position[order] = np.arange(len(order))
     structure = Structure(order, len(free), position[edges[:, 0]], position[edges[:, 1]], elimination, chosen)

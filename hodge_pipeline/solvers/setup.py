@@ -11,7 +11,6 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import check_graph
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.backends import BackendName
 from hodge_pipeline.solvers.chordal import initial_rotations
 from hodge_pipeline.solvers.newton import Point
 from hodge_pipeline.solvers.problem import Problem, make_problem, pinned_vertices
@@ -77,14 +76,12 @@ def prepare(
     start: Floats | None = None,
     fixed: Ints = NO_ROWS,
     dimension: DimensionName = None,
-    backend: BackendName = "auto",
     direct: bool = False,
 ) -> Setup:
     """The set-up of a graph; `direct`: a factorisation will be needed, whatever it costs.
 
     Raises `GraphError` where its numbers cannot be used.
     """
-    check_choice("backend", backend, BackendName)
     check_choice("dimension", dimension, DimensionName)
     check_graph(graph, start)
     size = dimension_of(graph) if dimension is None else dimension
@@ -100,7 +97,6 @@ def prepare(
         weights.kappa[weights.used],
         weights.tau[weights.used],
         pinned_vertices(component, fixed),
-        backend,
         direct,
     )
     return Setup(weights, size, component, gauge, gauge if start is None else se3.inverse(gauge) @ start, problem)
