@@ -22,7 +22,7 @@ from hodge_pipeline.start.unordered.start import Start
 from hodge_pipeline.store.store import Store
 from hodge_pipeline.types import CloudSet, Edges, Floats, Frame, Source, ViewGraph
 from stand_ins import Told
-from synthetic import LIGHT, tiny_sequence  # noqa: F401 - a fixture
+from synthetic import LIGHT, short_sequence, tiny_sequence  # noqa: F401 - a fixture
 
 
 def started(sequence: Path, stamps_s: Floats, up_to: str, steps: Store) -> Scene:
@@ -93,6 +93,37 @@ def test_landmarks_are_made_where_parts_are_joined_alone(tmp_path: Path) -> None
         scene = OdometryStart(relocalise=expected).joined(source, made, options, found, key_frames, store, InProcess())
         assert (len(scene.clouds.mark_points) > 0) == expected and len(scene.clouds) == 2
         np.testing.assert_array_equal(scene.clouds.points, made.points)
+
+
+@pytest.mark.parametrize(
+    ("apart_s", "readout_s", "moved"), [(0.22, 0.02, True), (0.22, 0.0, False), (1.0, 0.02, False)]
+)
+def test_landmarks_of_frames_registered_whole_are_of_the_moment_of_their_stamps(
+    apart_s: float,
+    readout_s: float,
+    moved: bool,
+    short_sequence: Path,  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    sets = [*LIGHT, "start.whole_up_to=auto", "clouds.landmarks=50"]
+    recipe, reader, steps = load_recipe("demo", sets, short_sequence), TumReader(), Store(tmp_path)
+    opened = reader.open(short_sequence)
+    frames = tuple(
+        replace(
+            frame,
+            stamp_s=apart_s * (row + 1),
+            colour_delay_s=0.0,
+            camera=frame.camera and replace(frame.camera, readout_s=readout_s),
+        )
+        for row, frame in enumerate(opened.frames[:4])
+    )
+    source = remembered(replace(opened, frames=frames), reader, steps, fingerprints(opened.files))
+    made = make_clouds(source, recipe.clouds, steps, InProcess())
+    scene = recipe.start.begin(source, recipe.clouds, steps, InProcess())
+    assert scene.key_frames.are_all and len(made.mark_points) > 20
+    np.testing.assert_array_equal(scene.clouds.points, made.points)
+    change_m = np.linalg.norm(scene.clouds.mark_points - made.mark_points, axis=1)
+    assert (float(np.median(change_m)) > 1e-4) == moved, "over a second a hand turns back: no velocity"
 
 
 def source_at(stamps_s: list[float]) -> Source:

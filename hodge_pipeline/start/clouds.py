@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from hodge_pipeline.registration.cloud_set import in_blocks, prepare_clouds
 from hodge_pipeline.registration.clouds import CloudOptions, landmarks_of
+from hodge_pipeline.registration.tracking.readout import with_readout
+from hodge_pipeline.registration.tracking.shutter import at_frame_stamp
+from hodge_pipeline.scene import has_real_stamps
 from hodge_pipeline.stages import Step, Steps, Workers, in_order
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.codec import CLOUDS
-from hodge_pipeline.types import CloudSet, Source
+from hodge_pipeline.types import CloudSet, Floats, Floats32, Frame, Source
 
 
 def make_clouds(source: Source, options: CloudOptions, steps: Steps, workers: Workers) -> CloudSet:
@@ -51,6 +57,44 @@ def add_landmarks(source: Source, made: CloudSet, options: CloudOptions, *, work
     for name in CloudSet.OF_POINTS:
         artifacts.link_or_copy(made.folder / f"{name}.npy", folder / f"{name}.npy")
     return CloudSet.open(folder)
+
+
+def with_landmarks_at_stamps(source: Source, made: CloudSet, twists: Floats, steps: Steps) -> CloudSet:
+    """The clouds of all frames, their landmarks moved to where they were at the stamps of the frames.
+
+    `twists (N, 6)`: see `shutter.velocities`. As they are without a clock, or where all pixels are of the moment of the
+    stamp.
+    """
+    late = any(frame.colour_delay_s or (frame.camera and frame.camera.readout_s) for frame in source.frames)
+    if not late or not len(made.mark_points) or not has_real_stamps(source.frames):
+        return made
+    return steps.step(at_stamps, source, made, twists, title="landmarks at the stamps of frames")
+
+
+def at_stamps(source: Source, made: CloudSet, twists: Floats, *, step: Step) -> CloudSet:
+    """Step: the clouds (N), their landmarks moved; all other files are linked, not copied."""
+    folder = step.folder / CLOUDS
+    folder.mkdir()
+    for name in set(CloudSet.FILES) - {"mark_points"}:
+        artifacts.link_or_copy(made.folder / f"{name}.npy", folder / f"{name}.npy")
+    np.save(folder / "mark_points.npy", landmarks_at_stamps(source.frames, made, twists))
+    return CloudSet.open(folder)
+
+
+def landmarks_at_stamps(
+    frames: Sequence[Frame], clouds: CloudSet, twists: Floats, readout_s: float | None = None
+) -> Floats32:
+    """The landmarks (Q, 3) of the clouds of these frames (K), where they were at the stamps of their frames.
+
+    `twists (K, 6)`: see `shutter.velocities`; `readout_s` takes the place of the cameras' own read-out.
+    """
+    points = np.array(clouds.mark_points)
+    for row, frame in enumerate(frames):
+        own = slice(*clouds.marks[row : row + 2].tolist())
+        if frame.camera is not None:
+            camera = with_readout(frame.camera, readout_s)
+            points[own] = at_frame_stamp(points[own].astype(float), camera, frame.colour_delay_s, twists[row])
+    return points
 
 
 def landmarks_for(clouds: CloudOptions, matching: GlobalStart) -> CloudOptions:

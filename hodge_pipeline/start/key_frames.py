@@ -20,9 +20,9 @@ from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chaine
 from hodge_pipeline.registration.tracking.blocks import BlockRows, TrackedBlocks
 from hodge_pipeline.registration.tracking.bridging import bridge
 from hodge_pipeline.registration.tracking.focal import estimate_focal
-from hodge_pipeline.registration.tracking.readout import estimate_readout, with_readout
+from hodge_pipeline.registration.tracking.readout import estimate_readout
 from hodge_pipeline.registration.tracking.repeats import find_repeats
-from hodge_pipeline.registration.tracking.shutter import at_frame_stamp, velocities
+from hodge_pipeline.registration.tracking.shutter import velocities
 from hodge_pipeline.registration.tracking.smoothing import VIDEO_STEP_S
 from hodge_pipeline.registration.tracking.tracker import FrameBlock, TrackingOptions, frame_blocks, track_block
 from hodge_pipeline.scene import (
@@ -37,6 +37,7 @@ from hodge_pipeline.scene import (
     vertex_ids,
 )
 from hodge_pipeline.stages import Advance, Step, Steps, Workers
+from hodge_pipeline.start.clouds import landmarks_at_stamps
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
 from hodge_pipeline.store.codec import CLOUDS
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Source
@@ -274,12 +275,9 @@ def _move_landmarks(source: Source, tracked: Tracked, twists: Floats) -> None:
     """Move the landmarks of the key frames, in their file, to where they were at the stamps of their frames."""
     if not len(tracked.clouds.mark_points):
         return
+    frames = [source.frames[row] for row in tracked.key_rows]
     points = np.load(tracked.clouds.folder / "mark_points.npy", mmap_mode="r+")
-    for key, row in enumerate(tracked.key_rows.tolist()):
-        own, frame = slice(*tracked.clouds.marks[key : key + 2].tolist()), source.frames[row]
-        if frame.camera is not None:
-            camera = with_readout(frame.camera, tracked.readout_s)
-            points[own] = at_frame_stamp(points[own].astype(float), camera, frame.colour_delay_s, twists[row])
+    points[:] = landmarks_at_stamps(frames, tracked.clouds, twists[tracked.key_rows], tracked.readout_s)
     points.flush()
 
 
