@@ -241,7 +241,7 @@ def test_a_break_of_tracking_is_bridged_by_what_free_space_does_not_refute(
     share: float, pairs: list[list[int]], folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tested: Any = lambda edges, *_: replace(edges, seen_through=np.full(len(edges), share))  # noqa: E731
-    monkeypatch.setattr(odometry_stage, "with_seen_through", tested)
+    monkeypatch.setattr("hodge_pipeline.registration.tracking.bridging.with_seen_through", tested)
     poses = path_of(3)
     motions = zip(se3.between(poses, np.array([[0, 1], [1, 2]])), (1.0, 0.0), strict=True)
     found = [Registration(motion, np.eye(6), fitness, 0.01, 100, 1, True) for motion, fitness in motions]

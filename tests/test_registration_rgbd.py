@@ -141,12 +141,13 @@ def test_landmarks_hold_where_a_plane_slides_and_too_few_of_them_leave_it_to_the
     found = registrar.register(target, source, np.eye(4))
     np.testing.assert_allclose(found.i_from_j[:3, 3], [0.1, 0, 0], atol=1e-3)
     assert found.fitness > 0.9 and np.linalg.eigvalsh(found.information).min() > 0
-    assert found.iterations == 0 and found.converged, "it stands whatever the guess"
+    assert found.iterations == 0 and found.converged and found.by_landmarks, "it stands whatever the guess"
     np.testing.assert_array_equal(registrar.register(target, source, I_FROM_J).i_from_j, found.i_from_j)
     target, source = (registrar.prepare(cloud) for cloud in frames_of(10))
     mean = registrar.register(target, source, np.eye(4))
     np.testing.assert_allclose(mean.i_from_j[:3, 3], [0.1, 0, 0], atol=5e-3)
     assert np.linalg.eigvalsh(found.information - mean.information).max() > 0 and mean.iterations > 0
+    assert not mean.by_landmarks
     target, source = (registrar.prepare(cloud) for cloud in frames_of(6))
     assert abs(registrar.register(target, source, np.eye(4)).i_from_j[0, 3]) < 0.05
 

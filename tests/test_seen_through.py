@@ -61,6 +61,8 @@ def test_what_slid_before_what_the_other_saw_through_is_no_edge(clouds: CloudSet
     assert set(Acceptance(min_spread=0, max_seen_through=None).reasons(registered)) == {""}
     with_scan = CloudSet.from_clouds([clouds[0], replace(clouds[1], depth_camera=None), clouds[2]])
     assert np.isnan(with_seen_through(registered, with_scan).seen_through).tolist() == [True, False, True]
+    by_landmarks = registered.put(1, by_landmarks=True)
+    assert np.isnan(with_seen_through(by_landmarks, clouds).seen_through).tolist() == [False, True, False]
 
 
 def test_the_unit_of_length_does_not_matter(clouds: CloudSet, registered: Edges) -> None:
@@ -113,18 +115,15 @@ def test_odometry_is_lost_at_a_step_that_free_space_refutes(
     assert all("rows 1 and 2 (surfaces fit" in note for note in found.notes)
 
 
-@pytest.mark.parametrize("by_free_space", [True, False])
-def test_the_step_of_registration_tells_what_was_seen_through(
-    clouds: CloudSet, by_free_space: bool, tmp_path: Path
-) -> None:
+def test_the_step_of_registration_tells_what_was_seen_through(clouds: CloudSet, tmp_path: Path) -> None:
     clouds.save(tmp_path / "clouds")
     poses = np.tile(np.eye(4), (3, 1, 1))
     with LocalExecutor(workers=0).open() as workers:
         found = register_edges(
             Edges.of(PAIRS), CloudSet.open(tmp_path / "clouds"), Gicp(), poses,
-            by_free_space=by_free_space, workers=workers, step=Step(tmp_path, lambda _: None, lambda *_: None),
+            workers=workers, step=Step(tmp_path, lambda _: None, lambda *_: None),
         )  # fmt: skip
-    np.testing.assert_array_equal(found.seen_through, [0.0] * 3 if by_free_space else [np.nan] * 3)
+    assert found.seen_through.tolist() == [0.0] * 3
 
 
 def test_a_cloud_of_a_depth_image_knows_its_camera_and_one_of_a_scan_has_none(tmp_path: Path) -> None:
@@ -146,13 +145,8 @@ def test_review_says_of_a_pair_added_by_hand_what_the_solve_will(clouds: CloudSe
 
 
 def test_depth_beside_a_model_is_tested_by_free_space_too(clouds: CloudSet, registered: Edges) -> None:
-    results, asked = iter([(clouds, ()), registered]), list[dict[str, Any]]()
-
-    def step(*_: Any, **resources: Any) -> Any:
-        asked.append(resources)
-        return next(results)
-
-    steps: Any = SimpleNamespace(step=step, remember=lambda *_: None, key=lambda _: "")
+    results = iter([(clouds, ()), registered])
+    steps: Any = SimpleNamespace(step=lambda *_, **__: next(results), remember=lambda *_: None, key=lambda _: "")
     eye, rows = np.eye(4), range(3)
     frames = [Frame(row, float(row), CAMERA, read_depth=lambda: np.zeros((1, 1)), world_from_cam=eye) for row in rows]
     model: Any = SimpleNamespace(
@@ -166,6 +160,5 @@ def test_depth_beside_a_model_is_tested_by_free_space_too(clouds: CloudSet, regi
         acceptance=Acceptance(min_spread=0.0),
     )
     found = depth_edges(model, options, steps, SimpleNamespace())
-    assert asked[1]["by_free_space"]
     assert found.graph.edges.tolist() == [PAIRS[0], PAIRS[2]]
     assert found.notes == (f"1 pair with depth left out: {SEEN_THROUGH}",)

@@ -6,10 +6,6 @@ import pytest
 
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.recipe import recipe_file
-from hodge_pipeline.recipe.schema import load_recipe
-from hodge_pipeline.registration.assessment import MOST_VIOLATION
-from hodge_pipeline.registration.odometry import OdometryOptions
-from hodge_pipeline.registration.rgbd import Rgbd
 from hodge_pipeline.store import yaml_file
 
 
@@ -189,14 +185,3 @@ def test_recipes_extend_each_other_eight_times_at_most(tmp_path: Path, length: i
     else:
         with pytest.raises(RecipeError, match="a chain of at most 8"):
             recipe_file.load(last)
-
-
-@pytest.mark.parametrize("name", sorted(set(recipe_file.recipe_names()) - {"colmap_refine"}))
-def test_free_space_tests_pairs_of_surfaces_and_none_of_landmarks(name: str) -> None:
-    recipe = load_recipe(name)
-    chosen = [(recipe.registration, recipe.acceptance.max_seen_through)]
-    start = getattr(recipe.start, "odometry", recipe.start)  # of poses given, that between them
-    if isinstance(start, OdometryOptions):
-        chosen.append((start.registration, start.max_seen_through))
-    for registrar, limit in chosen:
-        assert limit == (None if isinstance(registrar, Rgbd) else MOST_VIOLATION)

@@ -57,9 +57,8 @@ def depth_edges(model: TrackedModel, options: ModelRefinement, steps: Steps, wor
     held = held_out(len(pairs), PAIRS_HELD_OUT, options.seed)
     chosen = Edges.of(pairs[~held], "depth")
     registered = steps.step(
-        register_edges, chosen, clouds, options.registration, poses, by_free_space=options.acceptance.by_free_space,
-        title="registration", workers=workers,
-    )  # fmt: skip
+        register_edges, chosen, clouds, options.registration, poses, title="registration", workers=workers
+    )
     reasons = options.acceptance.reasons(registered)
     notes = (
         *notes,

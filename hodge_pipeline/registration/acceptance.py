@@ -48,14 +48,9 @@ class Acceptance:
         gt=0,
         lt=1,
         description="share of the points in view that the other depth image of a pair saw through, at most: more has a "
-        "pair that slid along a counter, a table or a wall, however well these fit. Of depth images alone; null: any, "
-        "as for landmarks, which do not slide, while what a rolling shutter bends may seem seen through",
+        "pair that slid along a counter, a table or a wall, however well these fit. Of depth images alone, and not "
+        "where landmarks gave the motion; null: any",
     )
-
-    @property
-    def by_free_space(self) -> bool:
-        """Whether registered pairs need `seen_through`."""
-        return self.max_seen_through is not None
 
     def reasons(self, registered: Edges, in_order: bool = True) -> NDArray[np.str_]:
         """Why each pair (P,) is rejected by itself, an empty word where it is accepted.

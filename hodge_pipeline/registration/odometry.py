@@ -19,7 +19,7 @@ from hodge_pipeline.registration.pairs import prepared_clouds
 from hodge_pipeline.registration.seen_through import is_refuted, with_seen_through
 from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
-from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Registration
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Registration
 
 STEPS_IN_BLOCK, WARM_UP_STEPS = 32, 2
 """Steps that a worker registers at once, and those before them that give it its first velocity."""
@@ -59,12 +59,6 @@ class OdometryOptions:
         description="share of the points in view that the other depth image of a step saw through, at most: beyond it "
         "the step slid, and tracking is lost; null: any",
     )
-
-    def tested(self, registered: Edges, clouds: CloudSet, scale: float) -> tuple[Edges, Bools]:
-        """The table with what a camera saw through, and where (P,) that refutes it; as it is without a limit."""
-        if self.max_seen_through is not None:
-            registered = with_seen_through(registered, clouds, scale)
-        return registered, is_refuted(registered, self.max_seen_through)
 
 
 @plain_dataclass(frozen=True)
@@ -110,8 +104,8 @@ def odometry(
     steps = Edges.joined([results[number] for number in range(len(blocks))])
     gap = over_gap(steps.pairs, sequences, stamps_s)
     lost = ~(steps.fitness >= np.where(gap, max(SURE_FITNESS, options.min_fitness), options.min_fitness))
-    steps, refuted = options.tested(steps, clouds, scale)
-    slid = ~lost & refuted
+    steps = with_seen_through(steps, clouds, scale)
+    slid = ~lost & is_refuted(steps, options.max_seen_through)
     poses = chained(len(sizes), sequences, steps, REACHES_APART * clouds.reach_m)
     notes = tuple(
         f"tracking was lost between rows {i} and {j} ({'a hole in the recording, ' if hole else ''}fitness "

@@ -31,7 +31,6 @@ def register_edges(
     scale: float = 1.0,
     min_spread: float = 0.0,
     earlier_from: Floats | None = None,
-    by_free_space: bool = False,
     *,
     workers: Workers,
     step: Step,
@@ -40,8 +39,7 @@ def register_edges(
 
     An `earlier` registration is kept where it needed no guess, where it is within `REUSE_WITHIN_M` of the guess from
     these poses, or, by GICP, where that guess is nearer to it than the earlier one, from `earlier_from (N, 4, 4)`:
-    GICP would converge to it again. `scale` multiplies lengths; `min_spread`: see `Acceptance`; `by_free_space`:
-    whether what a camera saw through is told.
+    GICP would converge to it again. `scale` multiplies lengths; `min_spread`: see `Acceptance`.
     """
     held_out = edges.status == HELD_OUT
     candidates = edges.select(~held_out)
@@ -64,9 +62,7 @@ def register_edges(
         columns = {name: getattr(earlier, name)[known] for name in REGISTERED}
         kept = replace(kept, status=np.full(len(rows), USED), **columns)
     every = Edges.joined([found, kept]).select(np.argsort(np.concatenate([missing, rows])))
-    if by_free_space:
-        every = with_seen_through(every, clouds, scale)
-    return Edges.joined([every, edges.select(held_out)])
+    return Edges.joined([with_seen_through(every, clouds, scale), edges.select(held_out)])
 
 
 def keep_block(folder: Path, block: int, result: Edges) -> None:

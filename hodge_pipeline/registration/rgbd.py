@@ -144,7 +144,7 @@ class Rgbd:
         found = self.geometry.register(target, source, i_from_j)
         if hint is None or found.correspondences == 0:
             return found
-        mean = self._assessed(target, source, _mean_motion(found, hint))
+        mean = replace(self._assessed(target, source, _mean_motion(found, hint)), by_landmarks=False)
         return mean if mean.fitness >= found.fitness - SAME_FITNESS else found
 
     def _within(self, target: PreparedFrame, source: PreparedFrame, i_from_j: Floats, distance_m: float) -> Assessment:
@@ -161,6 +161,7 @@ class Rgbd:
             correspondences=max(seen.correspondences, visual.inliers),
             iterations=1,
             converged=True,
+            by_landmarks=True,
         )
 
 

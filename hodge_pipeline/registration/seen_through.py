@@ -24,7 +24,8 @@ VIEWS_KEPT = 256
 
 def with_seen_through(registered: Edges, clouds: CloudSet, scale: float = 1.0) -> Edges:
     """The table with the share (P,) of the points in view that the other camera of a pair saw through, the larger of
-    both ways; NaN where a cloud is of no depth image, or they have too little in view of each other.
+    both ways; NaN where a cloud is of no depth image, they have too little in view of each other, or landmarks gave
+    the motion: these do not slide, and what a rolling shutter bends may seem seen through.
 
     `scale` multiplies lengths that are for rooms.
     """
@@ -39,7 +40,7 @@ def with_seen_through(registered: Edges, clouds: CloudSet, scale: float = 1.0) -
         return cloud_view(points, cloud.depth_camera, scale), points[evenly(len(points), POINTS_PROJECTED)]
 
     out = np.full(len(registered), np.nan)
-    for at in np.flatnonzero(registered.correspondences).tolist():
+    for at in np.flatnonzero((registered.correspondences > 0) & ~registered.by_landmarks).tolist():
         first, second = map(seen, registered.pairs[at].tolist())
         if first is not None and second is not None:
             (view_i, points_i), (view_j, points_j) = first, second

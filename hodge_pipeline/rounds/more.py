@@ -56,7 +56,6 @@ def register_more(
     return work.steps.step(
         register_named_pairs, pairs, guesses, proposed_by, work.scene.source, work.scene.clouds,
         work.recipe.registration, matching if np.isnan(guesses).any() else None, work.scale,
-        work.recipe.acceptance.by_free_space,
         title=title, total=len(pairs), workers=work.workers,
     )  # fmt: skip
 
@@ -70,14 +69,13 @@ def register_named_pairs(
     registrar: Registrar,
     matching: GlobalStart | None,
     scale: float,
-    by_free_space: bool,
     *,
     workers: Workers,
     step: Step,
 ) -> Edges:
     """Step: these pairs registered from their guesses (P, 4, 4), with `matching` where these are NaN.
 
-    `scale` multiplies lengths that are for rooms; `by_free_space`: see `register_edges`.
+    `scale` multiplies lengths that are for rooms.
     """
     unknown = np.asarray(np.isnan(guesses).any(axis=(1, 2)))
     near, far = pairs[~unknown], pairs[unknown]
@@ -87,7 +85,7 @@ def register_named_pairs(
         found.append(_without_guess(far, source, clouds.folder, registrar, matching, scratch, workers, step))
         step.advance(len(far))
     every = Edges.joined(found).put(slice(None), proposed_by=proposed_by)
-    return with_seen_through(every, clouds, scale) if by_free_space else every
+    return with_seen_through(every, clouds, scale)
 
 
 def _without_guess(

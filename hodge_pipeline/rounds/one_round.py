@@ -111,7 +111,6 @@ class Work:
         registered = self.steps.step(
             register_edges, edges, self.scene.clouds, self.recipe.registration, world_from_cam, earlier, self.scale,
             self.recipe.acceptance.min_spread, before.before if number > 1 else None,
-            self.recipe.acceptance.by_free_space,
             title=f"registration, round {number}", total=int((edges.status != HELD_OUT).sum()), workers=self.workers,
         )  # fmt: skip
         fresh = np.flatnonzero(registered.status != HELD_OUT)

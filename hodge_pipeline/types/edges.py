@@ -37,7 +37,7 @@ class Registration:
     """The registration of one pair; see `ViewGraph` for the meaning and units of each field.
 
     `iterations` counts the steps from the guess. A registrar that `converged` in none did not use the guess, so the
-    pair is not registered again from other poses.
+    pair is not registered again from other poses. `by_landmarks`: they gave the motion, not surfaces, which may slide.
     """
 
     i_from_j: Floats
@@ -47,6 +47,7 @@ class Registration:
     correspondences: int
     iterations: int
     converged: bool
+    by_landmarks: bool = False
 
 
 @dataclass(frozen=True)
@@ -148,8 +149,8 @@ class Edges:
       ones are legal. `proposed_by (E,)`: the reasons, joined by "+", or the format that a measured edge comes from.
       `overlap (E,)`: the score of the proposal in [0, 1].
     - Registered: `i_from_j`, `information`, `fitness`, `rmse_m`, `correspondences` as in `ViewGraph`, `iterations`, and
-      whether it `converged`. `seen_through (E,)`: the share of the points in view that the other depth camera saw
-      through.
+      whether it `converged`, and `by_landmarks`. `seen_through (E,)`: the share of the points in view that the other
+      depth camera saw through, where surfaces gave the motion.
     - Accepted: `status (E,)`, one of the six words; `why (E,)`: the reason of a rejection, later of the verdict.
     - Solved: `weight (E,)` relative to its own information, `residual_m`, `residual_rad (E,)` under the poses.
     - Judged: `verdict (E,)`; `probability (E,)` that it is right, NaN where untestable; `leverage (E,)`: its share in
@@ -167,6 +168,7 @@ class Edges:
     correspondences: Ints
     iterations: Ints
     converged: Bools
+    by_landmarks: Bools
     status: Words
     why: Words
     weight: Floats
@@ -203,6 +205,7 @@ class Edges:
             correspondences=whole,
             iterations=whole,
             converged=np.zeros(count, bool),
+            by_landmarks=np.zeros(count, bool),
             status=np.full(count, CANDIDATE),
             why=word,
             weight=number,
@@ -242,6 +245,7 @@ class Edges:
             correspondences=column("correspondences", (), np.int64),
             iterations=column("iterations", (), np.int64),
             converged=column("converged", (), np.bool_),
+            by_landmarks=column("by_landmarks", (), np.bool_),
             status=np.full(len(found), USED),
         )
 
@@ -289,5 +293,5 @@ class Edges:
 
 MEASURED = ("i_from_j", "information", "fitness", "rmse_m", "correspondences")
 """The columns that `Edges` and `ViewGraph` have in common."""
-REGISTERED = (*MEASURED, "seen_through", "iterations", "converged")
+REGISTERED = (*MEASURED, "seen_through", "iterations", "converged", "by_landmarks")
 """The columns of what a registrar finds."""

@@ -9,6 +9,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.registration.odometry import OdometryOptions
 from hodge_pipeline.registration.pairs import register_pairs
+from hodge_pipeline.registration.seen_through import is_refuted, with_seen_through
 from hodge_pipeline.stages import Workers
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
 
@@ -39,8 +40,8 @@ def bridge(
     pairs = np.unique(pairs, axis=0)
     guesses = se3.between(poses, pairs)
     found = register_pairs(clouds.folder, options.registration, Edges.of(pairs, "sequential"), guesses, workers)
-    found, refuted = options.tested(found, clouds, scale)
-    holds = (found.fitness >= options.min_fitness) & ~refuted
+    found = with_seen_through(found, clouds, scale)
+    holds = (found.fitness >= options.min_fitness) & ~is_refuted(found, options.max_seen_through)
     bridges, moved = [], poses.copy()
     for i, j in breaks.tolist():
         over = np.flatnonzero((found.pairs[:, 0] <= i) & (found.pairs[:, 1] >= j) & holds)

@@ -222,7 +222,8 @@ class _Tracker:
         self._corner_points[key.place] = key.corners.points
         self._sightings[key.place, view.place] = found
         information = found.information / CORNERS_A_SAMPLE
-        return Registration(found.key_from_view, information, found.share, found.rmse_m, len(found.rows), 1, True)
+        motion, count = found.key_from_view, len(found.rows)
+        return Registration(motion, information, found.share, found.rmse_m, count, 1, True, by_landmarks=True)
 
     def _of_most_area(
         self, key: TrackedFrame, view: TrackedFrame, found: Followed, guess: Floats
