@@ -6,6 +6,7 @@ import re
 import runpy
 import shlex
 import shutil
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import typer.main
 import hodge_pipeline
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.types import PointCloud, Registration
 from plugin_metadata import installed, write_metadata
 from synthetic import LIGHT, short_sequence  # noqa: F401 - a fixture
 
@@ -128,6 +130,12 @@ def short(workplace: Path) -> Path:
 )
 def test_the_page_shows_the_example_as_it_is(name: str, language: str) -> None:
     assert (EXAMPLE / name).read_text("utf-8") in blocks(DOCS / "writing-a-plugin.md", language)
+
+
+@pytest.mark.parametrize("kind", [PointCloud, Registration])
+def test_the_page_for_plugins_tells_every_field_of_what_comes_in_and_goes_out(kind: type) -> None:
+    listed = re.findall(r"^\| `(\w+)` \|", (DOCS / "writing-a-plugin.md").read_text("utf-8"), flags=re.M)
+    assert {field.name for field in fields(kind)} <= set(listed)
 
 
 def test_the_example_package_is_installed_and_runs(workplace: Path, tmp_path: Path) -> None:
