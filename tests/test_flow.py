@@ -9,15 +9,29 @@ import pytest
 from hodge_adapters.tum.reader import READOUT_S, TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
+from hodge_pipeline.registration.odometry import Odometry
 from hodge_pipeline.registration.pixels import back_project, project
 from hodge_pipeline.registration.tracking.flow import Corners, FlowImage, find_corners, flow_image, follow
 from hodge_pipeline.registration.tracking.readout import estimate_readout, with_readout
 from hodge_pipeline.registration.tracking.reposing import PosedBlock, repose
 from hodge_pipeline.registration.tracking.resection import resect
 from hodge_pipeline.registration.tracking.shutter import at_frame_stamp, velocities
-from hodge_pipeline.registration.tracking.sightings import Sightings
+from hodge_pipeline.registration.tracking.sightings import Sightings, views
+from hodge_pipeline.stages import Step, no_progress
+from hodge_pipeline.start.clouds import at_stamps
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.types import Camera, Floats, Frame, Source
+from hodge_pipeline.types import (
+    Camera,
+    CloudSet,
+    Edges,
+    Floats,
+    Frame,
+    Landmarks,
+    PointCloud,
+    Registration,
+    Source,
+)
+from hodge_pipeline.types.notes import Note
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 ROLLING = Camera(640, 480, 525.0, 525.0, 319.5, 239.5, readout_s=0.0225)
@@ -204,24 +218,31 @@ def test_readers_tell_the_shutter_and_by_how_much_colour_is_late(tmp_path: Path,
     assert source.frames[0].camera is not None and source.frames[0].camera.readout_s == 0.0
 
 
+def shaken(times: Floats, speed: float = 1.0) -> Floats:
+    """Poses of a shaken camera at these times."""
+    phases = speed * (1 + np.arange(6)) * times[:, None]
+    return se3.exp(0.1 * np.sin(7 * phases / np.arange(2, 8)) + 0.05 * np.cos(9 * phases / np.arange(3, 9)))
+
+
+def rolled(world: Floats, time_s: float, readout_s: float, speed: float = 1.0) -> Floats:
+    """Columns u, v, z of points in the world as that camera sees them at this time, row after row."""
+    late = np.full(len(world), time_s)
+    for _ in range(5):
+        views = se3.inverse(shaken(late, speed))
+        out = project(np.einsum("nij,nj->ni", views[:, :3, :3], world) + views[:, :3, 3], CAMERA)
+        late = time_s + readout_s * (out[:, 1] / CAMERA.height - 0.5)
+    return out
+
+
 def shaken_views(folder: Path, readout_s: float, speed: float = 1.0) -> tuple[Floats, Floats]:
     """Sightings of a shaken camera of this read-out: 12 key frames with three frames each; poses and velocities."""
     times, rng = np.arange(49) / 30, np.random.default_rng(2)
-
-    def world_from_cam(times: Floats) -> Floats:
-        phases = speed * (1 + np.arange(6)) * times[:, None]
-        return se3.exp(0.1 * np.sin(7 * phases / np.arange(2, 8)) + 0.05 * np.cos(9 * phases / np.arange(3, 9)))
-
-    poses = world_from_cam(times)
+    poses = shaken(times, speed)
     keys, points, frames, seen = [], [], [], []
     for key in range(0, 48, 4):
         world = se3.transform(poses[key], points_in_view(80, key))
         for row in range(key, key + 4):
-            late = np.full(80, times[row])
-            for _ in range(5):
-                views = se3.inverse(world_from_cam(late))
-                out = project(np.einsum("nij,nj->ni", views[:, :3, :3], world) + views[:, :3, 3], CAMERA)
-                late = times[row] + readout_s * (out[:, 1] / CAMERA.height - 0.5)
+            out = rolled(world, times[row], readout_s, speed)
             out[:, :2] += rng.normal(0, 0.3, (80, 2))
             if row == key:
                 points.append(back_project(out, CAMERA))
@@ -241,11 +262,11 @@ def frames_of(camera: Camera | None) -> list[Frame]:
 
 def test_the_read_out_is_estimated_where_nobody_gives_it(tmp_path: Path) -> None:
     poses, twists = shaken_views(tmp_path, 0.0225)
-    found = estimate_readout(tmp_path, frames_of(CAMERA), poses, twists, 1.0)
+    found = estimate_readout(views(tmp_path), frames_of(CAMERA), poses, twists, 1.0)
     assert found is not None and found.low_s < found.best_s < found.high_s
     assert found.best_s == pytest.approx(0.0225, abs=0.002)
-    assert estimate_readout(tmp_path, frames_of(None), poses, twists, 1.0) is None
-    assert estimate_readout(tmp_path, frames_of(CAMERA), poses, np.zeros_like(twists), 1.0) is None
+    assert estimate_readout(views(tmp_path), frames_of(None), poses, twists, 1.0) is None
+    assert estimate_readout(views(tmp_path), frames_of(CAMERA), poses, np.zeros_like(twists), 1.0) is None
 
 
 @pytest.mark.parametrize(("real_s", "taken_s"), [(ROLLING.readout_s, None), (0.0, 0.0), (-ROLLING.readout_s, -0.0225)])
@@ -253,12 +274,41 @@ def test_a_camera_s_own_read_out_stands_unless_another_surely_fits_better(
     tmp_path: Path, real_s: float, taken_s: float | None
 ) -> None:
     poses, twists = shaken_views(tmp_path, real_s)
-    found = estimate_readout(tmp_path, frames_of(ROLLING), poses, twists, 1.0)
+    found = estimate_readout(views(tmp_path), frames_of(ROLLING), poses, twists, 1.0)
     assert (found and found.best_s) == taken_s
     assert with_readout(ROLLING, taken_s).readout_s == real_s
+
+
+@pytest.mark.parametrize("real_s", [ROLLING.readout_s, -ROLLING.readout_s])
+def test_landmarks_of_frames_registered_whole_are_moved_by_the_read_out_that_they_fit(
+    tmp_path: Path, real_s: float
+) -> None:
+    times, rng = np.arange(14) / 30, np.random.default_rng(3)
+    poses, world = shaken(times), points_in_view(80)
+    descriptors, pixel_rad = rng.integers(0, 255, (80, 128)).astype(np.uint8), np.full(80, 1 / CAMERA.fx, np.float32)
+    clouds = []
+    for time_s in times.tolist():
+        seen = rolled(world, time_s, real_s)
+        seen[:, :2] += rng.normal(0, 0.3, (80, 2))
+        points = back_project(seen, CAMERA).astype(np.float32)
+        clouds.append(PointCloud(points, landmarks=Landmarks(points, descriptors, pixel_rad)))
+    CloudSet.from_clouds(clouds).save(tmp_path / "made")
+    pairs = np.stack([np.arange(13), np.arange(1, 14)], axis=1)
+    motions = se3.between(poses, pairs)
+    steps = [Registration(motion, np.eye(6), 1.0, 0.0, 80, 1, True, by_landmarks=True) for motion in motions]
+    found = Odometry(poses, Edges.of(pairs, "sequential").with_registrations(steps), ())
+    frames = tuple(Frame(row, time_s, camera=ROLLING) for row, time_s in enumerate(times.tolist()))
+    source, notes = Source("shaken", tmp_path, frames), list[Note]()
+    (tmp_path / "clouds").mkdir()  # of a run that was killed
+    made = CloudSet.open(tmp_path / "made")
+    moved = at_stamps(source, made, found, 1.0, step=Step(tmp_path, no_progress, lambda *told: notes.extend(told)))
+    assert [note.kind for note in notes] == (["other readout"] if real_s < 0 else [])
+    true = np.concatenate([se3.transform(se3.inverse(pose), world) for pose in poses])
+    before_m, after_m = (float(np.median(np.linalg.norm(one.mark_points - true, axis=1))) for one in (made, moved))
+    assert after_m < 0.6 * before_m
 
 
 @pytest.mark.parametrize(("readout_s", "speed"), [(0.0, 1.0), (0.06, 1.0), (0.0225, 0.01)])
 def test_no_read_out_is_estimated_without_a_clear_minimum(tmp_path: Path, readout_s: float, speed: float) -> None:
     poses, twists = shaken_views(tmp_path, readout_s, speed)  # read at once; slower than video; hardly moves
-    assert estimate_readout(tmp_path, frames_of(CAMERA), poses, twists, 1.0) is None
+    assert estimate_readout(views(tmp_path), frames_of(CAMERA), poses, twists, 1.0) is None

@@ -23,6 +23,7 @@ from hodge_pipeline.registration.tracking.focal import estimate_focal
 from hodge_pipeline.registration.tracking.readout import estimate_readout
 from hodge_pipeline.registration.tracking.repeats import find_repeats
 from hodge_pipeline.registration.tracking.shutter import velocities
+from hodge_pipeline.registration.tracking.sightings import views
 from hodge_pipeline.registration.tracking.smoothing import VIDEO_STEP_S
 from hodge_pipeline.registration.tracking.tracker import FrameBlock, TrackingOptions, frame_blocks, track_block
 from hodge_pipeline.scene import (
@@ -37,7 +38,7 @@ from hodge_pipeline.scene import (
     vertex_ids,
 )
 from hodge_pipeline.stages import Advance, Step, Steps, Workers
-from hodge_pipeline.start.clouds import landmarks_at_stamps
+from hodge_pipeline.start.clouds import landmarks_at_stamps, other_readout
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
 from hodge_pipeline.store.codec import CLOUDS
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Source
@@ -214,16 +215,12 @@ def _camera_estimates(
     fit.
     """
     notes, readout_s = list[Note](), None
-    readout = estimate_readout(sightings, source.frames, world_from_cam, twists, unit_m)
+    readout = estimate_readout(views(sightings), source.frames, world_from_cam, twists, unit_m)
     if readout is not None:
         readout_s = readout.best_s
         best, low, high = (f"{1e3 * time_s:.0f}" for time_s in (readout.best_s, readout.low_s, readout.high_s))
         own = {frame.camera.readout_s for frame in source.frames if frame.camera is not None}
-        other, estimated = (
-            Note("other readout", detail=f"{best} ms"),
-            Note("readout", detail=f"{best} ms ({low} to {high})"),
-        )
-        notes.append(other if any(own) else estimated)
+        notes.append(other_readout(readout) if any(own) else Note("readout", detail=f"{best} ms ({low} to {high})"))
     focal = estimate_focal(sightings, source.frames, world_from_cam, twists, readout_s, unit_m)
     if focal is not None and focal.is_other:
         detail = f"{focal.best:.0f} pixels ({focal.low:.0f} to {focal.high:.0f}) better than its {focal.own:.0f}"

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.tracking.reposing import view_at_stamps
 from hodge_pipeline.registration.tracking.resection import resect, robust_cost
-from hodge_pipeline.registration.tracking.sightings import View, views
+from hodge_pipeline.registration.tracking.sightings import View
 from hodge_pipeline.types import Camera, Floats, Frame, Ints
 from hodge_pipeline.types.arrays import evenly, groups
 
@@ -50,9 +49,9 @@ def with_readout(camera: Camera, readout_s: float | None) -> Camera:
 
 
 def estimate_readout(
-    sightings: Path, frames: Sequence[Frame], world_from_cam: Floats, twists: Floats, unit_m: float
+    views: Iterable[View], frames: Sequence[Frame], world_from_cam: Floats, twists: Floats, unit_m: float
 ) -> Readout | None:
-    """The read-out time of least reprojection error in views (a folder of `Sightings`), their poses estimated with it.
+    """The read-out time of least reprojection error in views, their poses estimated with it.
 
     `twists (N, 6)`: see `shutter.velocities`. None where cameras differ, and where the minimum is not clear: near
     either end of the times tried, with too wide an interval, or with too few key frames. A camera's own read-out stands
@@ -65,7 +64,7 @@ def estimate_readout(
         return None
     own_s = camera.readout_s
     tried_s = own_s * np.array([1.0, 0.0, -1.0]) if own_s else TRIED_S
-    moving = [view for view in views(sightings) if moves[view.key] and moves[view.row]]
+    moving = [view for view in views if moves[view.key] and moves[view.row]]
     keys, costs = list[int](), list[Floats]()
     for view in (moving[at] for at in evenly(len(moving), MOST_VIEWS)):
         start = se3.inverse(world_from_cam[view.key]) @ world_from_cam[view.row]
