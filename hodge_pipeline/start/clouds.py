@@ -92,7 +92,8 @@ def at_stamps(source: Source, made: CloudSet, found: Odometry, unit_m: float, *,
     folder.mkdir(exist_ok=True)  # a killed run left it
     for name in set(CloudSet.FILES) - {"mark_points"}:
         artifacts.link_or_copy(made.folder / f"{name}.npy", folder / f"{name}.npy")
-    np.save(folder / "mark_points.npy", landmarks_at_stamps(frames, made, twists, readout and readout.best_s))
+    readout_s = None if readout is None else readout.best_s
+    np.save(folder / "mark_points.npy", landmarks_at_stamps(frames, made, twists, readout_s))
     return CloudSet.open(folder)
 
 
