@@ -85,6 +85,10 @@ class Model:
     def moved(self, poses: Floats) -> Any:
         return self._inner if self._how == "stays" else self._inner.moved(poses)
 
+    def adjusted(self, **options: Any) -> Any:
+        found = self._inner.adjusted(**options)
+        return replace(found, has_converged="perhaps") if self._how == "untold" else found
+
     def measured(self) -> Any:
         graph, notes = self._inner.measured()
         return (replace(graph, i_from_j=1.1 * graph.i_from_j), notes) if self._how == "sheared" else (graph, notes)

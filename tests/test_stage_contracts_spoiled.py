@@ -153,6 +153,7 @@ def test_a_rewriter_that_breaks_its_contract_is_noticed(rewriter: Any, what: str
         (Models("one scale"), "another unit", "does not double the positions"),
         (Models("thins all"), "thinned", "of a model that has few"),
         (Models("stays"), "moved", "not at the poses that were given"),
+        (Models("untold"), "adjusted", "whether its adjustment converged"),
         (Models("no notes"), "read back", "the notes are lost"),
     ],
 )

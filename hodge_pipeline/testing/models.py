@@ -97,6 +97,14 @@ def _is_moved(case: _Case) -> None:
     _assert_near(model.world_from_body, before, "moving a model changes the model itself")
 
 
+def _is_adjusted(case: _Case) -> None:
+    model = _model(case)
+    found = model.adjusted(move_bodies=False)
+    told = getattr(found, "has_converged", None)
+    assert isinstance(told, bool), "an adjusted model does not tell whether its adjustment converged (has_converged)"
+    _assert_near(found.world_from_body, model.world_from_body, "bodies move where points alone are adjusted")
+
+
 def _is_read_back(case: _Case) -> None:
     model = _model(case)
     with tempfile.TemporaryDirectory() as name:
@@ -123,6 +131,7 @@ check_model_reader = Contract(
         "another unit": _is_scaled,
         "thinned": _is_thinned,
         "moved": _is_moved,
+        "adjusted": _is_adjusted,
         "read back": _is_read_back,
     },
     _Case,
