@@ -236,7 +236,8 @@ def vertex_rows(vertex_ids: NDArray[np.generic], pairs: Sequence[str]) -> Ints:
     found = [[(rows[a], rows[b]) for a, b in _cuts(pair) if a in rows and b in rows and a != b] for pair in pairs]
     for pair, ends in zip(pairs, found, strict=True):
         if not ends:
-            raise GraphError(f"{pair}: names no two frames: give two ids, as 12-87, of {names[0]} to {names[-1]}")
+            which = f"{len(names)} from {names[0]} to {names[-1]}, of a video its key frames alone"
+            raise GraphError(f"{pair}: names no two frames of the graph ({which}): give two ids, as 12-87")
     return np.array([ends[0] for ends in found], np.int64).reshape(-1, 2)
 
 
