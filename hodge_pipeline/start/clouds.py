@@ -77,7 +77,9 @@ def with_landmarks_at_stamps(source: Source, made: CloudSet, found: Odometry, un
 
 
 def at_stamps(source: Source, made: CloudSet, found: Odometry, unit_m: float, *, step: Step) -> CloudSet:
-    """Step: the clouds (N), their landmarks moved; all other files are linked, not copied."""
+    """Step: the clouds (N), their landmarks moved, by their camera's read-out unless they surely fit another; all other
+    files are linked, not copied. `unit_m`: length units per metre.
+    """
     poses, frames, readout = found.world_from_cam, source.frames, None
     piece = connected_components(found.steps.pairs, len(made))
     twists = velocities(poses, stamps_of(source), piece, np.ones(len(made), bool))
