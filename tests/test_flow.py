@@ -18,7 +18,7 @@ from hodge_pipeline.registration.tracking.resection import resect
 from hodge_pipeline.registration.tracking.shutter import at_frame_stamp, velocities
 from hodge_pipeline.registration.tracking.sightings import Sightings, views
 from hodge_pipeline.stages import Step, no_progress
-from hodge_pipeline.start.clouds import at_stamps
+from hodge_pipeline.start.at_stamps import at_stamps
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import (
     Camera,

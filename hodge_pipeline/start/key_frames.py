@@ -38,7 +38,7 @@ from hodge_pipeline.scene import (
     vertex_ids,
 )
 from hodge_pipeline.stages import Advance, Step, Steps, Workers
-from hodge_pipeline.start.clouds import landmarks_at_stamps, other_readout
+from hodge_pipeline.start.at_stamps import landmarks_at_stamps, other_readout
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
 from hodge_pipeline.store.codec import CLOUDS
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Source

@@ -17,7 +17,8 @@ from hodge_pipeline.registration.odometry_path import drift_of
 from hodge_pipeline.scene import START, Closed, KeyFrames, Round, Scene, key_source, sequences_of, vertex_ids
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import Step, Steps, Workers
-from hodge_pipeline.start.clouds import make_clouds, with_landmarks, with_landmarks_at_stamps
+from hodge_pipeline.start.at_stamps import with_landmarks_at_stamps
+from hodge_pipeline.start.clouds import make_clouds, with_landmarks
 from hodge_pipeline.start.unordered.join import join_parts
 from hodge_pipeline.start.unordered.loops import find_loops, is_long
 from hodge_pipeline.start.unordered.options import GlobalStart
