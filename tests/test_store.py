@@ -416,6 +416,12 @@ def test_another_shape_than_the_code_expects_is_a_value_error(tmp_path: Path, te
         codec.load(tmp_path, Value)
 
 
+def test_a_value_of_another_version_is_told_by_what_it_lacks(tmp_path: Path) -> None:
+    (tmp_path / "value.json").write_text('{"number": 1}')
+    with pytest.raises(ValueError, match=r"^Value without inner, rows: another version wrote it$"):
+        codec.load(tmp_path, Value)
+
+
 def test_a_file_of_two_names_leaves_no_draft(tmp_path: Path) -> None:
     (tmp_path / "made").write_text("x")
     for _ in range(2):

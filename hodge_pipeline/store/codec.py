@@ -101,6 +101,8 @@ def _typed(folder: Path, plain: Any, kind: Any, arrays: Mapping[str, NDArray[Any
         return _inside(folder, plain)
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
         hints = _types_of(kind)
+        if lost := [name for name in _needed(kind) if name not in plain]:
+            raise ValueError(f"{kind.__name__} without {', '.join(lost)}: another version wrote it")
         return kind(**{name: _typed(folder, item, hints[name], arrays) for name, item in plain.items()})
     if origin is tuple:
         item = [parts[0]] * len(plain) if parts[-1] is ... else list(parts)
@@ -115,6 +117,16 @@ def _typed(folder: Path, plain: Any, kind: Any, arrays: Mapping[str, NDArray[Any
 @cache  # `get_type_hints` compiles what each field is annotated with
 def _types_of(kind: type) -> dict[str, Any]:
     return get_type_hints(kind)
+
+
+def _needed(kind: Any) -> list[str]:
+    """The fields of a dataclass without a default."""
+    no_default = dataclasses.MISSING
+    return [
+        field.name
+        for field in dataclasses.fields(kind)
+        if field.default is no_default and field.default_factory is no_default
+    ]
 
 
 def _inside(folder: Path, name: str) -> Path:
