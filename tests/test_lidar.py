@@ -11,7 +11,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from hodge_adapters.clouds.columns import seconds_after_first
+from hodge_adapters.clouds.columns import points_of_columns, seconds_after_first
 from hodge_adapters.clouds.fragments import Fragment, read_fragment
 from hodge_adapters.clouds.ply import write_ply
 from hodge_adapters.clouds.reader import CloudFolderReader
@@ -70,6 +70,22 @@ def test_times_come_with_the_points_of_a_pcd(tmp_path: Path) -> None:
     read = CloudFolderReader(units_per_metre=1000).open(tmp_path).frames[0].read_points
     assert read is not None and read().times_s == pytest.approx([0.0, 0.08, 0.1])  # in millimetres too
     assert read().points_in_cam[1] == pytest.approx([0.004, 0.005, 0.006])
+
+
+@pytest.mark.parametrize(
+    ("name", "unit_s"),
+    [("time_offset", 1e-9), ("relative_time", 1e-3), ("GpsTime", 1.0), ("ts", 1e-6), ("t_us", 1e-6), ("Stamp", 1.0)],
+)
+def test_times_of_points_have_many_names(name: str, unit_s: float) -> None:
+    seconds, points = np.array([0, 0.05, 0.1]), dict.fromkeys("xyz", np.ones(3))
+    cloud = points_of_columns(Path(), points | {"t": np.zeros(3), name: seconds / unit_s})
+    assert cloud.times_s == pytest.approx(seconds)  # the column `t` tells nothing
+
+
+@pytest.mark.parametrize(("name", "unit_s"), [("gps_time", 1e-3), ("t_us", 1e-9), ("T", 1.0), ("intensity", 1.0)])
+def test_what_is_in_other_units_than_its_name_says_is_no_time(name: str, unit_s: float) -> None:
+    columns = dict.fromkeys("xyz", np.ones(3)) | {name: np.array([0, 0.05, 0.1]) / unit_s}
+    assert points_of_columns(Path(), columns).times_s is None
 
 
 def scanner(noise: float = 0.0) -> SpinningScanner:

@@ -118,14 +118,16 @@ def far_file(name: str, text: bool) -> bytes:
 
 @pytest.mark.parametrize("text", [True, False])
 @pytest.mark.parametrize("name", ["a.ply", "a.pcd", "a.vtk", "a.xyz"])
-def test_map_coordinates_are_counted_from_whole_kilometres(tmp_path: Path, name: str, text: bool) -> None:
+def test_map_coordinates_are_counted_from_the_whole_metres_of_their_middle(
+    tmp_path: Path, name: str, text: bool
+) -> None:
     if name == "a.xyz" and not text:
         pytest.skip("a table is text")
     (tmp_path / name).write_bytes(far_file(name, text))
     source = CloudFolderReader().open(tmp_path)
     found = source.frames[0].read_points()
-    np.testing.assert_allclose(found.points_in_cam, FAR[:2] - [500_000, 5_400_000, 0], atol=1e-5)
-    assert any(f"{name}: lies far" in note and "counted from 500000 5400000 0" in note for note in source.notes)
+    np.testing.assert_allclose(found.points_in_cam, FAR[:2] - [500_000, 5_400_001, 100], atol=1e-5)
+    assert any(f"{name}: lies far" in note and "counted from 500000 5400001 100" in note for note in source.notes)
     told = PlyWriter().write(tmp_path / "out.ply", source)
     assert "1 point that is not finite left out" in told
     in_millimetres = CloudFolderReader(units_per_metre=1000.0).open(tmp_path)

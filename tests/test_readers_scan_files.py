@@ -16,15 +16,26 @@ from readers_data import some_poses
 from scan_data import FAR, ROOM, write_e57, write_las
 
 
-def test_las_files_count_from_one_corner(tmp_path: Path) -> None:
+def test_las_files_count_from_the_whole_metres_of_their_middle(tmp_path: Path) -> None:
     write_las(tmp_path / "tile_0.las", FAR + ROOM)
     write_las(tmp_path / "tile_1.las", FAR + ROOM + [10, 0, 0], bits=8)
     source = check_reader(CloudFolderReader(), tmp_path)
     first, second = (frame.read_points() for frame in source.frames)
-    np.testing.assert_allclose(first.points_in_cam, ROOM - ROOM.min(axis=0), atol=2e-4)
+    np.testing.assert_allclose(first.points_in_cam, FAR + ROOM - [431_006, 5_401_002, 121], atol=2e-4)
     np.testing.assert_allclose(second.points_in_cam - first.points_in_cam, np.tile([10, 0, 0], (50, 1)), atol=2e-4)
     assert first.colours[0].tolist() == second.colours[0].tolist() == [200, 200, 0]
-    assert source.notes[0].startswith("coordinates of 2 LAS files are counted from their common lower corner 431000.")
+    assert source.notes == ("coordinates of 2 LAS files are counted from their middle 431006 5401002 121",)
+
+
+def test_las_sweeps_keep_the_scanners_axes_and_the_times_of_their_points(tmp_path: Path) -> None:
+    path, points, times_s = tmp_path / "sweep_0.las", ROOM - [1, 1, 1], np.linspace(7.0, 7.1, len(ROOM))
+    source = CloudFolderReader().open(write_las(path, points, times_s=times_s))
+    cloud = source.frames[0].read_points()
+    np.testing.assert_allclose(cloud.points_in_cam, points, atol=2e-4)
+    np.testing.assert_allclose(cloud.times_s, times_s - 7.0, atol=1e-6)
+    assert not source.notes
+    minutes = CloudFolderReader().open(write_las(path, points, times_s=100 * times_s))  # no second in milliseconds
+    assert minutes.frames[0].read_points().times_s is None
 
 
 def test_each_scan_of_an_e57_is_a_posed_frame(tmp_path: Path) -> None:
@@ -48,13 +59,13 @@ def test_far_tables_count_from_the_corner_of_the_las_files(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("turned", [True, False])
-def test_far_scans_of_an_e57_count_from_whole_kilometres_unless_turned(tmp_path: Path, turned: bool) -> None:
+def test_far_scans_of_an_e57_count_from_whole_metres_unless_turned(tmp_path: Path, turned: bool) -> None:
     poses = some_poses(1) if turned else np.eye(4)[None]
     source = CloudFolderReader().open(write_e57(tmp_path / "hall.e57", poses, [FAR + ROOM]))
-    off = np.zeros(3) if turned else [431_000, 5_401_000, 0]
+    off = np.zeros(3) if turned else np.round(np.median((FAR + ROOM).astype(np.float32).astype(float), axis=0))
     stored = (FAR + ROOM).astype(np.float32).astype(float)  # as pye57 writes them
     np.testing.assert_allclose(source.frames[0].read_points().points_in_cam, stored - off, atol=1e-4)
-    assert any("counted from 431000 5401000 0" in note for note in source.notes) != turned
+    assert any("counted from 43100" in note for note in source.notes) != turned
 
 
 @pytest.mark.parametrize("name", ["a.las", "a.e57"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -19,11 +19,15 @@ NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 COLOURS = ("red", "green", "blue")
 PACKED = ("rgb", "rgba")
 """Colours of four bytes, 0xAARRGGBB, declared as a float by PCL's convention."""
-TIMES = ("t", "time", "timestamp", "time_stamp", "offset_time")
-"""When a point was measured: Ouster, Velodyne, Hesai and Livox name it differently, and count in their own units."""
+UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
+TIMES = dict.fromkeys(
+    ("t", "time", "timestamp", "offsettime", "timeoffset", "ts", "relativetime", "pointtime", "stamp"), UNITS_S
+) | {"tus": (1e-6,), "gpstime": (1.0,)}
+"""When a point was measured, by names without case and underscores, and the units that each may be counted in: drivers
+of Ouster, Velodyne, Hesai and Livox, and programs after them, name it differently. LAS counts seconds."""
 REVOLUTION_S = (0.01, 2.0)
 """A spinning scanner's: it tells seconds from milli-, micro- and nanoseconds."""
-NAMES = frozenset((*"xyz", *COLOURS, *PACKED, *TIMES, *NORMALS[0], *NORMALS[1]))
+NAMES = frozenset((*"xyz", *COLOURS, *PACKED, *NORMALS[0], *NORMALS[1]))
 MAX_METRES = 1e9
 ROWS_IN_PART, LINES_IN_PART = 1 << 20, 1 << 17
 Columns: TypeAlias = Mapping[str, Any]
@@ -43,7 +47,7 @@ def points_of_parts(path: Path, parts: Iterable[Columns], corner: Corner = ZERO)
     points: list[Floats32] = []
     normals: list[Floats32] = []
     colours: list[NDArray[Any]] = []
-    times: list[Floats] = []
+    times: dict[str, list[Floats]] = {}
     no_numbers = 0
     for columns in parts:
         if not all(name in columns for name in "xyz"):
@@ -58,11 +62,10 @@ def points_of_parts(path: Path, parts: Iterable[Columns], corner: Corner = ZERO)
             normals.append(_unit(_stack(columns, names)[finite]))
         if all(name in columns for name in COLOURS):
             colours.append(_raw_colours(columns, finite))
-        time = next((name for name in TIMES if name in columns), None)
-        if time:
-            times.append(np.asarray(columns[time][finite], float))
+        for name in filter(is_time, columns):
+            times.setdefault(name, []).append(np.asarray(columns[name][finite], float))
     joined = _joined(points)
-    times_s, first_s = seconds_after_first(_joined(times), joined.any(axis=1)) if times else (None, 0.0)
+    times_s, first_s = _times_of({name: _joined(parts) for name, parts in times.items()}, joined.any(axis=1))
     return PointCloud(
         joined,
         _joined(normals) if normals else None,
@@ -73,9 +76,30 @@ def points_of_parts(path: Path, parts: Iterable[Columns], corner: Corner = ZERO)
     )
 
 
+def is_time(name: str) -> bool:
+    """Whether a column of this name may hold when points were measured."""
+    return _folded(name) in TIMES
+
+
+def _folded(name: str) -> str:
+    return name.lower().replace("_", "") if len(name) > 1 else name  # T is a temperature
+
+
+def _times_of(columns: Mapping[str, Floats], returned: Bools) -> tuple[Floats32 | None, float]:
+    """As `seconds_after_first` says, of the first of columns (N,), in the order of `TIMES`, that gives a revolution."""
+    ranks = list(TIMES)
+    for name in sorted(columns, key=lambda one: ranks.index(_folded(one))):
+        times_s, first_s = seconds_after_first(columns[name], returned, TIMES[_folded(name)])
+        if times_s is not None:
+            return times_s, first_s
+    return None, 0.0
+
+
 def far_corner(columns: Columns, units_per_metre: float) -> Corner:
-    """The corner to count the points of columns from: whole kilometres, in the units of the columns, where they lie far
-    from zero with more digits than float32 has; else zero.
+    """The corner to count the points of columns from: the whole metres of their middle, in the units of the columns,
+    where they lie far from zero with more digits than float32 has; else zero.
+
+    A scanner's reach, and with it the size of a sweep's voxels, is counted from there.
     """
     axes = [np.asarray(columns[axis]) for axis in "xyz" if axis in columns]
     if len(axes) < 3 or np.result_type(np.float32, *axes) == np.float32:
@@ -83,7 +107,9 @@ def far_corner(columns: Columns, units_per_metre: float) -> Corner:
     points = np.column_stack(axes)
     with np.errstate(invalid="ignore"):
         points = points[(np.abs(points) < MAX_METRES).all(axis=1)]
-    x, y, z = (units_per_metre * whole_kilometres(points / units_per_metre)).tolist()
+    if not whole_kilometres(points / units_per_metre).any():
+        return ZERO
+    x, y, z = (units_per_metre * np.round(np.median(points, axis=0) / units_per_metre)).tolist()
     return x, y, z
 
 
@@ -106,7 +132,9 @@ def as_declared(column: Floats, code: str) -> NDArray[Any]:
         return np.ascontiguousarray(column.astype(kind))
 
 
-def seconds_after_first(times: Floats, returned: Bools) -> tuple[Floats32 | None, float]:
+def seconds_after_first(
+    times: Floats, returned: Bools, units_s: Sequence[float] = UNITS_S
+) -> tuple[Floats32 | None, float]:
     """When each point (N,) was measured, seconds after the first, and when that was, whatever unit a revolution is
     counted in; none where no unit gives a revolution. Points that did not return may have any time: they get 0.
     """
@@ -114,7 +142,7 @@ def seconds_after_first(times: Floats, returned: Bools) -> tuple[Floats32 | None
     if not len(told) or not np.isfinite(told).all():
         return None, 0.0
     first, last = float(told.min()), float(told.max())
-    for unit in (1.0, 1e-3, 1e-6, 1e-9):
+    for unit in units_s:
         # Two moments are no revolution: float32 counts seconds since 1970 in steps of two minutes.
         if REVOLUTION_S[0] <= (last - first) * unit <= REVOLUTION_S[1] and ((told > first) & (told < last)).any():
             return np.where(returned, (times - first) * unit, 0).astype(np.float32), first * unit

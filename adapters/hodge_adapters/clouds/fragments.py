@@ -73,13 +73,13 @@ def fragments_of(files: list[Path], units_per_metre: float, notes: list[str]) ->
         found += [Fragment(file, scan.row, world_from_scan=_flat(scan.world_from_scan)) for scan in scans]
         found += [] if scans else [Fragment(file, world_from_scan=_flat(uos_pose(file)))]
     others = [fragment for fragment in found if fragment.path not in las and fragment.path.suffix.lower() in PARTS]
-    corner = las_corner(las, is_all=len(las) == len(files)) if las else None
-    if corner is not None:
-        words = " ".join(f"{value:.3f}" for value in corner)
-        notes.append(f"coordinates of {len(las)} LAS files are counted from their common lower corner {words}")
+    corner = las_corner(las, units_per_metre, is_all=len(las) == len(files)) if las else None
+    if corner is not None and any(corner):
+        words = " ".join(f"{value:.0f}" for value in corner)
+        notes.append(f"coordinates of {len(las)} LAS files are counted from their middle {words}")
     far = _far_corner(others[0], units_per_metre) if others else ZERO
     if any(far):
-        far = corner or far
+        far = corner if corner is not None and any(corner) else far
         words = " ".join(f"{value:.0f}" for value in far)
         notes.append(
             f"{others[0].name}: lies far from zero, where 32-bit numbers lose digits: coordinates of "

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hodge_adapters.clouds.columns import COLOURS, ROWS_IN_PART, Columns, Corner, parts_of
+from hodge_adapters.clouds.columns import COLOURS, ROWS_IN_PART, ZERO, Columns, Corner, parts_of
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
@@ -25,6 +25,7 @@ MAX_POINTS_A_BYTE, ALWAYS_POINTS = 4, 1 << 20
 """LAZ and E57 store a scanner's points in 1 to 20 bytes each, equal ones in next to none: more points than this for
 each byte of a file, past the first million, are no scan."""
 
+LAS_TIME = "gps_time"
 LAS_HEADER, LAS_14_HEADER = 227, 375
 """Bytes of the public header of LAS 1.2 and 1.4 (ASPRS LAS 1.4 R15, tables 3 and 20)."""
 RECORD_HEADER, EXTENDED_RECORD_HEADER = 54, 60
@@ -40,27 +41,31 @@ class Scan:
     world_from_scan: Floats | None
 
 
-def las_corner(paths: Sequence[Path], *, is_all: bool = True) -> Corner | None:
-    """The lower corner (x, y, z) of those of these files that can be opened, from their headers.
+def las_corner(paths: Sequence[Path], units_per_metre: float, *, is_all: bool = True) -> Corner | None:
+    """The whole metres in the middle of those of these files that can be opened, in their units, from their headers;
+    zero where zero is nearer to them than they are large: these are in a scanner's axes.
 
-    None where there is none; `is_all`: raises `SourceError` then, since no other file is there to be read.
+    None where there is no such file; `is_all`: raises `SourceError` then, since no other file is there to be read.
     """
     corners, fault = [], None
     for path in paths:
         try:
             with _named(path, "laspy"), _opened_las(path) as file:
                 _check_points(path, file.header.point_count)
-                corners.append(np.asarray(file.header.mins, float))
+                corners.append(np.array([file.header.mins, file.header.maxs], float))
         except SourceError as error:  # said again where the cloud is read
             fault = error
     if not corners:
         if fault is not None and is_all:
             raise fault
         return None
-    low = np.min(corners, axis=0)
-    if not np.isfinite(low).all():
+    low, high = np.min(corners, axis=0)[0], np.max(corners, axis=0)[1]
+    if not np.isfinite([low, high]).all():
         raise SourceError(f"{paths[0]}: the header's corner is not finite: mend it, or convert the file to PLY")
-    return float(low[0]), float(low[1]), float(low[2])
+    if (np.maximum(low, -high) <= np.max(high - low)).all():
+        return ZERO
+    x, y, z = (units_per_metre * np.round((low + high) / 2 / units_per_metre)).tolist()
+    return x, y, z
 
 
 def _check_counts(path: Path) -> None:
@@ -105,8 +110,8 @@ def _las_chunks(file: Any) -> Iterator[Any]:
 
 
 def _las_columns(part: Any) -> Columns:
-    coloured = "red" in part.point_format.dimension_names
-    return {name: np.asarray(part[name]) for name in (*"xyz", *(COLOURS if coloured else ()))}
+    names = (*"xyz", *({*COLOURS, LAS_TIME} & {*part.point_format.dimension_names}))
+    return {name: np.asarray(part[name]) for name in names}
 
 
 def e57_scans(path: Path) -> list[Scan]:

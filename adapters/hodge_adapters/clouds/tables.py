@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
-from hodge_adapters.clouds.columns import NAMES, Columns, number_rows
+from hodge_adapters.clouds.columns import NAMES, Columns, is_time, number_rows
 from hodge_adapters.clouds.ply import COLOURS
 from hodge_adapters.text_rows import first_text, reading, to_floats
 from hodge_pipeline.errors import SourceError
@@ -46,7 +46,7 @@ def table_parts(path: Path) -> Iterator[Columns]:
     width = len(names) or len(row.encode().translate(separators).split())
     if width < 3:
         raise SourceError(f"{path}: its first line holds no x, y and z: give a file of points")
-    if twice := next((name for name in names if name in NAMES and names.count(name) > 1), None):
+    if twice := next((name for name in names if (name in NAMES or is_time(name)) and names.count(name) > 1), None):
         raise SourceError(f"{path}: its first line names {twice} twice: rename one of the columns")
     names = names or [*"xyz", *(f"_{at}" for at in range(3, width))]
     return row_parts(path, names, skipped, separators, said)

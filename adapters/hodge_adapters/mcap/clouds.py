@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_adapters.clouds.columns import TIMES, far_corner, points_of_columns, unpacked
+from hodge_adapters.clouds.columns import far_corner, is_time, points_of_columns, unpacked
 from hodge_adapters.mcap.fields import Message, Payload, part, parts, pose_values, text, whole
 from hodge_adapters.mcap.records import Malformed
 from hodge_pipeline import se3
@@ -109,7 +109,7 @@ def _checked(
         raise Malformed("a cloud of more points than 64 million, or of points without a size")
     if width * height and (not width * step <= row_step <= length or row_step * (height - 1) + width * step > length):
         raise Malformed("a cloud with fewer bytes than its size needs")
-    wanted = tuple(field for field in fields if field[0] in _READ_FIELDS or (field[0] in TIMES and _fits(field, step)))
+    wanted = tuple(field for field in fields if field[0] in _READ_FIELDS or (is_time(field[0]) and _fits(field, step)))
     if {"x", "y", "z"} - {name for name, _, _ in wanted}:
         raise Malformed("a cloud without the fields x, y and z")
     if len({name for name, _, _ in wanted}) < len(wanted):
