@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -26,7 +27,7 @@ from hodge_pipeline.registration.sweeps import (
 )
 from hodge_pipeline.sources.frame_facts import frame_facts
 from hodge_pipeline.start.sweeps import Sweeps, _jumps, key_rows
-from hodge_pipeline.types import Frame, PointCloud
+from hodge_pipeline.types import Floats, Frame, PointCloud
 from lidar_worlds import scanner_in
 from street_sweeps import (
     COUNT,
@@ -281,3 +282,15 @@ def test_a_sweep_without_points_in_the_middle_hides_no_scanner_and_is_named() ->
 
 def nothing_of(cloud: PointCloud) -> PointCloud:
     return PointCloud(cloud.points_in_cam[:0])
+
+
+def test_sweeps_in_map_coordinates_are_said() -> None:
+    poses = true_poses(range(COUNT))
+    poses = se3.inverse(poses[0]) @ poses
+
+    def moved(pose: Floats, cloud: PointCloud) -> PointCloud:
+        return PointCloud(se3.transform(pose, cloud.points_in_cam.astype(float)).astype(np.float32))
+
+    frames = [changed(frame, partial(moved, pose)) for frame, pose in zip(street(), poses, strict=True)]
+    assert "seem to be in map coordinates: the middle of their points moves by 1" in followed(frames)[1]
+    assert "map coordinates" not in street_followed()[1]

@@ -50,6 +50,7 @@ REASONS = {
     "colour of another moment": "colour seems to be of another moment than depth",
     "focal length": "images contradict the camera's focal length",
     "scan unit": "its unit seems not to be the metre",
+    "sweeps in map": "the sweeps seem to be in map coordinates",
     "left apart": "a guess joins what tracking left apart",
     "wrong": "edges that it uses are judged wrong",
 }

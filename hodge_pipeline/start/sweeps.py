@@ -74,6 +74,9 @@ UNEVEN_VOXELS, UNEVEN, GRIP_M_S2 = 0.2, 5.0, 9.81
 a voxel (alignments of 24 simulated sequences scatter by up to 0.12), than as many times what is usual around there, and
 than an acceleration of 1 g moves it, more than tyres hold. Turns are not judged: one that sets in on the spot, at 90
 degrees a second, is as far off as a false one of 4 degrees."""
+IN_MAP_REACH = 0.1
+"""Share of the reach by which the middles of sweeps move, at the median, and twice as far as the scanner, where they
+are in map coordinates: of a scanner at rest they move with what passes, of one in motion it moves by more."""
 TOLD = 5
 """Unevenly placed sweeps that are named."""
 AS_TOLD = 0.0, FORWARDS
@@ -173,6 +176,9 @@ def follow(
     jumps = [one for part in parts for one in part.jumps]
     if jumps:
         step.note(Note("sweeps uneven", len(jumps), ", ".join(jumps[:TOLD]) + ", …" * (len(jumps) > TOLD)))
+    in_map_m = max(part.in_map_m for part in parts)
+    if in_map_m:
+        step.note(Note("sweeps in map", 1, f"{in_map_m:.3g} m"))
     clocked = [rows for rows in sequences if is_clock(stamps[rows])]
     step.note(*told_gaps(clocked, stamps, vertex_ids(source)))
     step.note(*_notes_of_times(revolution_s, sense))
@@ -194,7 +200,8 @@ def _notes_of_times(revolution_s: Floats, sense: Ints) -> list[Note]:
 class _Followed(NamedTuple):
     """One sequence: poses (M, 4, 4) at the stamps, velocities (M, 6), which (M,) sweeps were read, where (M,) the
     alignment was loose; whether points have times; how these are read (`retimed_frame`); the reach of the scanner in
-    metres; what is odd; sweeps off the even motion around them.
+    metres; what is odd; sweeps off the even motion around them; metres by which the middles of sweeps move where these
+    seem to be in map coordinates, else 0.
     """
 
     world_from_scan: Floats
@@ -207,6 +214,7 @@ class _Followed(NamedTuple):
     reach_m: float
     odd: list[Oddity]
     jumps: list[str]
+    in_map_m: float
 
 
 def _follow_one(
@@ -235,7 +243,7 @@ def _follow_as_told(
     count, is_timed, rows, odd = len(frames), False, list[int](), list[Oddity]()
     poses, velocity, middle_s = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6)), np.zeros(count)
     found, loose, original = np.zeros(count, bool), np.zeros(count, bool), np.arange(count)
-    jumps = list[str]()
+    jumps, middles, in_map_m = list[str](), np.zeros((count, 3)), 0.0
     begun, strange = first_velocity(voxel_m, timed_sweeps(frames[:WARM_UP], times, clouds, usual_m))
     tracker = ScanToMap(voxel_m, begun)
 
@@ -248,6 +256,7 @@ def _follow_as_told(
                 odd.append(Oddity(frames[row].frame_id, LEFT_OUT, STRANGE))
             elif sweep.cloud is not None:
                 latest = row
+                middles[row] = np.median(sweep.cloud.points_in_cam, axis=0)
                 middle_s[row] = first_after_s(sweep.cloud, frames[row].stamp_s)
                 yield row, times[row], sweep.cloud
             advance(1)
@@ -267,8 +276,19 @@ def _follow_as_told(
         is_numbered = not is_timed and not is_clock(np.array([frame.stamp_s for frame in frames]))
         seconds = times[rows] * (REVOLUTION_S / NO_CLOCK_S if is_numbered else 1.0)
         jumps = _jumps([str(frames[row].frame_id) for row in rows], poses[rows], seconds, voxel_m)
+        in_map_m = _in_map_m(middles[rows], poses[rows], usual_m)
         poses = poses[rows][last] @ se3.exp(-middle_s[rows][last][:, None] * velocity)  # to the stamp
-    return _Followed(poses, velocity, found, loose, is_timed, *AS_TOLD, usual_m, odd, jumps)
+    return _Followed(poses, velocity, found, loose, is_timed, *AS_TOLD, usual_m, odd, jumps, in_map_m)
+
+
+def _in_map_m(middles: Floats, poses: Floats, reach_m: float) -> float:
+    """Metres by which the middles (N, 3) of sweeps move while the scanner hardly does by its poses (N, 4, 4), as where
+    sweeps are in map coordinates; else 0.
+    """
+    moved_m, found_m = (
+        float(np.median(np.linalg.norm(places - places[0], axis=1))) for places in (middles, poses[:, :3, 3])
+    )
+    return moved_m if moved_m > max(IN_MAP_REACH * reach_m, 2 * found_m) else 0.0
 
 
 def _jumps(names: list[str], poses: Floats, times_s: Floats, voxel_m: float) -> list[str]:

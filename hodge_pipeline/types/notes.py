@@ -39,6 +39,8 @@ INPUTS = {
     "focal length": "The camera's intrinsics are probably wrong: what frames saw of each other fits a focal length of "
     "{detail} (source.reader.camera, or the file it is read from).",
     "scan unit": "{detail}",
+    "sweeps in map": "The sweeps seem to be in map coordinates: the middle of their points moves by {detail}, yet they "
+    "fit each other as they are. Give them in the scanner's axes, as it measured them.",
     "other scale": "The true path is {detail} times as large as this one: depth is read in the wrong unit (--set "
     "source.reader.depth_scale), or with another camera's focal length, or the truth is not in metres, or not of the "
     "camera.",
