@@ -48,3 +48,8 @@ def test_frames_lost_at_an_end_are_carried_on_ten_steps_at_most() -> None:
     frames = KeyFrames(np.array([0, 9]), poses, poses[[0, 9]], zeros, times, found, times, zeros, zeros)
     expected = 2 * np.minimum(np.arange(30), 19)
     np.testing.assert_allclose(frames.expand(frames.world_from_key)[:, 0, 3], expected, atol=1e-9)
+
+    poses[:8, 1, 3] = 50.0  # another part, whose place is a guess
+    parts = replace(frames, first=poses, world_from_key=poses[[0, 9]], part=(np.arange(30) >= 8).astype(np.int64))
+    after = parts.expand(parts.world_from_key)[8:]
+    np.testing.assert_allclose(after[:, :2, 3], np.stack([expected[8:], 0 * expected[8:]], axis=1), atol=1e-9)
