@@ -11,9 +11,12 @@ import pytest
 
 from hodge_adapters.seven_scenes.reader import SevenScenesReader
 from hodge_adapters.tum.reader import TumReader
+from hodge_pipeline.cli.list import next_command
 from hodge_pipeline.sources.colour_on_depth import image_doubts
 from hodge_pipeline.sources.depth_units import PRIMESENSE_STEP, doubts_of, inverse_step
+from hodge_pipeline.sources.inspect import inspect
 from hodge_pipeline.types import Floats32, Frame
+from readers_data import tum_folder, write_colour, write_depth
 
 PIXELS = 20
 
@@ -92,6 +95,19 @@ def test_nearer_than_a_camera_of_such_steps_sees_is_another_unit(step: float, wi
     assert np.median(near) < 0.25
     (note,) = doubts_of(near, width_px)
     assert note.kind == kind and ("depth_scale=1000" in note.detail) == (kind == "depth unit")
+
+
+def test_the_unit_that_is_told_is_in_the_next_command(tmp_path: Path) -> None:
+    tum_folder(tmp_path)
+    (tmp_path / "intrinsics.txt").write_text("525 525 319.5 239.5 640 480")
+    millimetres = np.resize(np.round(1000 * in_steps(1.63e-3, 0.6, 2.0)), (480, 640)).astype(np.uint16)
+    for image in (tmp_path / "depth").iterdir():
+        write_depth(image, millimetres)
+        write_colour(tmp_path / f"rgb/{float(image.stem) + 0.01:.6f}.png", size=(480, 640))
+    found = inspect(tmp_path)
+    assert any("source.reader.depth_scale=1000" in odd for odd in found["oddities"])
+    assert " --set source.reader.depth_scale=1000 " in next_command(tmp_path, found, None)
+    assert "missing" not in inspect(tmp_path, TumReader(depth_scale=4999))
 
 
 def test_images_that_cannot_be_read_are_passed_over() -> None:

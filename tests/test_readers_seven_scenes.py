@@ -23,6 +23,8 @@ from readers_data import (
     write_depth,
 )
 
+KINECT = Camera(640, 480, 585, 585, 320, 240)
+
 
 @pytest.fixture
 def sequence(tmp_path: Path) -> Path:
@@ -169,9 +171,11 @@ def test_a_link_back_to_the_scene_is_no_endless_walk(scene: Path) -> None:
 def test_intrinsics_by_option_and_the_published_ones(sequence: Path) -> None:
     given = SevenScenesReader(camera=(9, 8, 4, 3)).open(sequence).frames[0].camera
     assert given == Camera(WIDTH, HEIGHT, 9, 8, 4, 3)
-    (sequence / "camera-intrinsics.txt").unlink()
+    of_colour = (sequence / "camera-intrinsics.txt").rename(sequence / "camera-intrinsics.color.txt")
+    assert SevenScenesReader().open(sequence).frames[0].camera != resized(KINECT, (WIDTH, HEIGHT))
+    of_colour.unlink()
     source = SevenScenesReader().open(sequence)
-    assert source.frames[0].camera == resized(Camera(640, 480, 585, 585, 320, 240), (WIDTH, HEIGHT))
+    assert source.frames[0].camera == resized(KINECT, (WIDTH, HEIGHT))
     assert "585 585 320 240" in source.notes[0]
     with pytest.raises(SourceError, match="no pinhole camera"):
         SevenScenesReader(camera=(0, 8, 4, 3)).open(sequence)

@@ -45,7 +45,7 @@ def doubts_of(depth_m: NDArray[np.floating[Any]], width_px: int = NEAR_WIDTH_PX)
     by_steps = None if step is None else _by_steps(step, median)
     if by_steps is not None:
         return (by_steps,)
-    if median < PLAUSIBLE_DEPTH_M[0] and step is not None and step > NEAR_STEP * NEAR_WIDTH_PX / width_px:
+    if step is not None and _is_too_near(step, median, width_px):
         return (Note("depth unit", detail=_too_near(step, median)),)
     if not PLAUSIBLE_DEPTH_M[0] < median < PLAUSIBLE_DEPTH_M[1]:
         return (Note("depth range", detail=f"the median depth is {median:.3g} m"),)
@@ -54,6 +54,16 @@ def doubts_of(depth_m: NDArray[np.floating[Any]], width_px: int = NEAR_WIDTH_PX)
     if far > FAR_M:
         return (Note("depth range", detail=f"a quarter of depth lies beyond {far:.3g} m, as out of doors"),)
     return ()
+
+
+def are_millimetres_as_tums(depth_m: NDArray[np.floating[Any]], width_px: int = NEAR_WIDTH_PX) -> bool:
+    """Whether depths, read at TUM's 5000 a metre, are rather stored in millimetres, as `doubts_of` says."""
+    valid = depth_m[depth_m > 0]
+    step = inverse_step(valid) if len(valid) else None
+    if step is None:
+        return False
+    median = float(np.median(valid))
+    return _by_steps(step, median) is None and _is_too_near(step, median, width_px)
 
 
 def inverse_step(depth_m: NDArray[np.floating[Any]]) -> float | None:
@@ -73,6 +83,10 @@ def inverse_step(depth_m: NDArray[np.floating[Any]]) -> float | None:
     base = float(np.median(steps[steps <= 1.5 * np.quantile(steps, 0.2)]))
     multiples = steps / base
     return base if (np.abs(multiples - np.round(multiples)) < WHOLE).mean() > MOSTLY else None
+
+
+def _is_too_near(step: float, median_m: float, width_px: int) -> bool:
+    return median_m < PLAUSIBLE_DEPTH_M[0] and step > NEAR_STEP * NEAR_WIDTH_PX / width_px
 
 
 def _too_near(step: float, median_m: float) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.colour_on_depth import Agreement, agreement, colour_doubts
-from hodge_pipeline.sources.depth_units import PLAUSIBLE_DEPTH_M, SAMPLED_FRAMES, doubts_of
+from hodge_pipeline.sources.depth_units import PLAUSIBLE_DEPTH_M, SAMPLED_FRAMES, are_millimetres_as_tums, doubts_of
 from hodge_pipeline.types import Bools, Camera, Floats, Floats32, Frame, PointCloud, Trajectory
 from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.text import UNKNOWN_UNIT, counted
@@ -214,9 +214,12 @@ def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]
     values = np.concatenate(depths) if depths else np.zeros(0)
     valid = values[values > 0]
     median = float(np.median(valid)) if len(valid) else None
+    missing = None
     if with_depth and with_depth[0].read_depth is not None:
         camera, widths = with_depth[0].camera, [frame.camera.width for frame in with_depth if frame.camera is not None]
-        units = doubts_of(valid, max(widths)) if widths else doubts_of(valid)
+        width = (max(widths),) if widths else ()
+        units = doubts_of(valid, *width)
+        missing = ["source.reader.depth_scale=1000"] if are_millimetres_as_tums(valid, *width) else None
         oddities.extend(str(doubt) for doubt in (*units, *colour_doubts(edges, camera)))
     elif median is not None and not PLAUSIBLE_DEPTH_M[0] < median < PLAUSIBLE_DEPTH_M[1]:
         oddities.append(f"the median distance is {median:.3g} m: are the points in metres?")
@@ -226,6 +229,7 @@ def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]
         "median depth in metres": median,
         "share without depth": float(1 - len(valid) / len(values)) if len(values) else None,
         "unreadable among them": faults,
+        "missing": missing,
     }
 
 

@@ -75,7 +75,8 @@ def inspect(path: Path, reader: FrameReader | None = None) -> dict[str, Any]:
     left out. `missing` lists options that the reader needs.
     """
     known = guesses(path) if path.is_file() or path.is_dir() else []
-    source, camera_error = _opened(reader or guess_reader(path, known), path)
+    taken = reader or guess_reader(path, known)
+    source, camera_error = _opened(taken, path)
     oddities = [*map(str, filter(None, [camera_error])), *map(str, source.doubts)]
     unit = METRES if source.in_metres else OWN_UNIT
     facts: dict[str, Any] = {
@@ -85,9 +86,11 @@ def inspect(path: Path, reader: FrameReader | None = None) -> dict[str, Any]:
     }
     if source.frames:
         facts.update(frame_facts(source.frames, oddities, unit))
+    if getattr(taken, "depth_scale", 0) is not None:  # a scale of the user's, or of another format than TUM's
+        facts.pop("missing", None)
     if camera_error is not None:
         facts["cameras"] = ["{}x{}, intrinsics unknown".format(*camera_error.size)]
-        facts["missing"] = [f"source.reader.camera={camera_error.camera}"]
+        facts["missing"] = [*(facts.get("missing") or ()), f"source.reader.camera={camera_error.camera}"]
     if source.trajectory is not None:
         facts["trajectory poses"] = len(source.trajectory)
         if not source.frames and len(source.trajectory):

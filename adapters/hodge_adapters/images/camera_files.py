@@ -23,6 +23,7 @@ _DISTORTION = ("k1", "k2", "k3", "p1", "p2")
 CAMERA_FILES = (
     "intrinsics.txt",
     "camera-intrinsics.txt",
+    "camera-intrinsics.color.txt",
     "camera.yaml",
     "camera.txt",
     "calibration.yaml",
@@ -39,8 +40,9 @@ CAMERA_FILES = (
     "TUM2.yaml",
     "TUM3.yaml",
 )
-"""Usual names, also of Open3D, whose recordings of a RealSense or an Azure Kinect have `intrinsic.json`, ScanNet's
-exporter, Replica as NICE-SLAM renders it, Stray Scanner, deep-video-mvs, BundleFusion and ORB-SLAM."""
+"""Usual names, also of Open3D, whose recordings of a RealSense or an Azure Kinect have `intrinsic.json`, of tools in
+7-Scenes' layout (`camera-intrinsics.color.txt`: depth is registered to colour), ScanNet's exporter, Replica as
+NICE-SLAM renders it, Stray Scanner, deep-video-mvs, BundleFusion and ORB-SLAM."""
 LONGEST_READOUT_S = 1.0
 """Upper bound on a rolling shutter's read-out time: slower cameras give no video."""
 _SUPPORTED = "`fx fy cx cy [width height]` on one line, a 3x3 matrix, `fx: …` lines, or Open3D's JSON"
