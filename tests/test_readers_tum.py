@@ -120,7 +120,7 @@ def stamped_lists(folder: Path, stamps_s: list[float]) -> StampedImages:
         lines = [f"{stamp_s + delay_s:.6f} {kind}/{number}.png\n" for number, stamp_s in enumerate(stamps_s)]
         (folder / f"{kind}.txt").write_text("".join(lines))
         for number in range(len(stamps_s)):
-            (folder / kind / f"{number}.png").touch()
+            (folder / kind / f"{number}.png").write_text(str(number))
     return read_pairs(folder, 0.02, [])
 
 
@@ -291,6 +291,27 @@ def test_pairs_are_near_unique_and_none_is_missed(depth: list[int], colour: list
     free_depth = {row for row, column in enumerate(pairs) if column < 0}
     free_colour = set(range(len(colour))) - {column for _, column in found}
     assert not any(abs(depth[row] - colour[column]) <= 2 for row in free_depth for column in free_colour)
+
+
+@pytest.mark.parametrize(
+    ("depth", "colour", "delay_s"),
+    [
+        ("aabbccdd", "AABBCCDD", 0.01),  # the copies of each lie nearer to the other's neighbours than its own
+        ("aaaaaaaa", "ABCDEFGH", 0.005),  # empty depth
+        ("abcdefgh", "AAAAAAAA", 0.005),  # at rest, without noise of colour
+    ],
+)
+def test_copies_are_paired_by_the_stamp_of_the_first(tmp_path: Path, depth: str, colour: str, delay_s: float) -> None:
+    for kind, contents, later_s in (("depth", depth, 0.0), ("rgb", colour, delay_s)):
+        (tmp_path / kind).mkdir()
+        lines = []
+        for number, content in enumerate(contents):
+            (tmp_path / kind / f"{number}.png").write_text(content)
+            lines.append(f"{100 + number / 60 + later_s:.6f} {kind}/{number}.png\n")
+        (tmp_path / f"{kind}.txt").write_text("".join(lines))
+    found = read_pairs(tmp_path, 0.02, notes := [])
+    assert [path and path.read_text() for path in found.colour] == list(colour)
+    assert np.allclose(found.colour_delays_s, delay_s, atol=1e-5) and notes == []
 
 
 def test_the_nearer_depth_gets_the_colour_image() -> None:

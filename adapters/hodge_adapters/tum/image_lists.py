@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -126,20 +127,53 @@ def _from_lists(folder: Path, max_difference_s: float, notes: list[str]) -> Stam
     if not colour and not colour_list.is_file():
         notes.append("no rgb.txt: frames have no colour")
         return StampedImages(depth_stamps_s, depth, [None] * len(depth), np.zeros(len(depth)), lists, runs)
-    columns = nearest_in_runs(depth_stamps_s, runs, colour_stamps_s, colour_runs, max_difference_s)
+    firsts, colour_firsts = _first_copies(depth, runs), _first_copies(colour, colour_runs)
+    columns = np.full(len(depth), -1, np.int64)
+
+    def pair(rows: Ints, among: Ints) -> None:
+        found = nearest_in_runs(
+            depth_stamps_s[rows], runs[rows], colour_stamps_s[among], colour_runs[among], max_difference_s
+        )
+        columns[rows] = np.append(among, -1)[found]
+
+    new, new_colour = np.unique(firsts), np.unique(colour_firsts)
+    pair(new, new_colour)
+    pair(np.flatnonzero(columns < 0), np.setdiff1d(new_colour, columns))  # depth that is empty is alike, colour is not
+    pair(new[columns[new] < 0], np.setdiff1d(np.arange(len(colour)), new_colour))  # rendered colour at rest is alike
+    as_first = (columns < 0) & (columns[firsts] >= 0)
+    columns = np.where(as_first, columns[firsts], columns)
+    moments_s = np.where(as_first, depth_stamps_s[firsts], depth_stamps_s)
     alone = int((columns < 0).sum())
     if alone:
         notes.append(f"{alone} of {len(depth)} depth images have no colour image within {max_difference_s:g} s")
     if alone == len(depth) and colour:
         nearest_s = round(float(np.abs(colour_stamps_s - depth_stamps_s[alone // 2]).min()), 3)
         notes[-1] += f", the nearest is {nearest_s:g} s away: set max_difference_s, or are they of two clocks?"
-    unpaired = len(colour) - len(np.unique(columns[columns >= 0]))
+    unpaired = len(np.setdiff1d(new_colour, columns))
     if unpaired:
         notes.append(f"{unpaired} of {len(colour)} colour images have no depth image within {max_difference_s:g} s")
     paired = [colour[column] if column >= 0 else None for column in columns.tolist()]
-    delays_s = np.where(columns >= 0, np.append(colour_stamps_s, 0.0)[columns] - depth_stamps_s, 0.0)
+    delays_s = np.where(columns >= 0, np.append(colour_stamps_s, 0.0)[columns] - moments_s, 0.0)
     doubts = unpaired_doubts((columns >= 0).tolist()) if colour else ()
     return StampedImages(depth_stamps_s, depth, paired, delays_s, lists, runs, doubts)
+
+
+def _first_copies(images: list[Path], runs: Ints) -> Ints:
+    """The row (N,) of the image of which each is a copy, itself where it is none: of copies in sequence, as a recorder
+    writes that sees no new image, the first alone has the stamp of its moment.
+    """
+    rows = np.arange(len(images))
+    for row in range(1, len(images)):
+        if runs[row] == runs[row - 1] and _are_copies(images[row - 1], images[row]):
+            rows[row] = rows[row - 1]
+    return rows
+
+
+def _are_copies(one: Path, other: Path) -> bool:
+    try:
+        return filecmp.cmp(one, other, shallow=False)  # files of two sizes, as nearly all are, are not read
+    except OSError:
+        return False
 
 
 def stamped_images(folder: Path) -> list[tuple[float, Path]]:
