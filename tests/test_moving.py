@@ -20,7 +20,7 @@ from hodge_pipeline.registration.tracking.frame import TrackedFrame
 from hodge_pipeline.registration.tracking.moving import MUCH, Moments, contradicting, misplaced, rival_motion
 from hodge_pipeline.registration.tracking.sightings import Sightings
 from hodge_pipeline.stages import Step, no_progress
-from hodge_pipeline.start.key_frames import KeyFrameStart, Tracked, track
+from hodge_pipeline.start.key_frames import KeyFrameStart, Tracked, _puts_in_doubt, track
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import Frame, Source
 from hodge_pipeline.types.notes import Note
@@ -162,6 +162,12 @@ def test_an_object_that_may_have_been_followed_puts_the_path_in_doubt(
     _, notes = tracked(source, tmp_path / "large")
     (note,) = [note for note in notes if note.kind == "camera or object"]
     assert note.count > FRAMES / 4
+
+
+def test_a_few_doubtful_frames_of_a_short_sequence_are_chance() -> None:
+    assert [_puts_in_doubt(count, 12) for count in (2, 3, 4)] == [False, False, True]
+    assert [_puts_in_doubt(count, 60) for count in (9, 11)] == [False, True]
+    assert [_puts_in_doubt(count, 1000) for count in (100, 101)] == [False, True]
 
 
 def test_the_vote_is_by_area_whichever_motion_is_found_first(still: Source) -> None:

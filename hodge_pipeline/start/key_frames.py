@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
+from scipy.special import bdtrc
 
 from hodge_pipeline.complex.components import connected_components, in_runs
 from hodge_pipeline.registration.cloud_set import no_clouds
@@ -48,9 +49,10 @@ from hodge_pipeline.types.text import counted
 NOTES_SHOWN = 5
 WHOLE_STILLS = 300
 """Frames up to which `auto` registers every frame of what is no video, whose steps optical flow may not bridge."""
-DOUBTED = 0.1
+STILL, DOUBTED, BY_CHANCE = 0.07, 0.1, 0.01
 """Share of the frames whose motion may be an object's, from which the whole path is in doubt: of fr1/rpy's every third
-frame, where nothing moves but much is blurred, 0.07 are.
+frame, where nothing moves but much is blurred, the first are. So many of a few frames may be chance: the last is the
+probability of as many where that share is usual, below which they are not.
 """
 
 
@@ -278,6 +280,11 @@ def _move_landmarks(source: Source, tracked: Tracked, twists: Floats) -> None:
     points.flush()
 
 
+def _puts_in_doubt(doubtful: int, frames: int) -> bool:
+    """Whether so many doubtful frames are more than a still scene has."""
+    return doubtful > DOUBTED * frames and bool(bdtrc(doubtful - 1, frames, STILL) < BY_CHANCE)
+
+
 def _notes(source: Source, tracked: Tracked, parts: list[BlockRows], repeats: Ints) -> tuple[Note, ...]:
     ids, sequences = vertex_ids(source), list(sequences_of(source).values())
 
@@ -306,7 +313,7 @@ def _notes(source: Source, tracked: Tracked, parts: list[BlockRows], repeats: In
     notes += listed("blank images", rows_of("blank"))
     notes += listed("moving objects", rows_of("moving"))
     doubtful = rows_of("doubtful")
-    if len(doubtful) > DOUBTED * len(tracked.anchors):
+    if _puts_in_doubt(len(doubtful), len(tracked.anchors)):
         detail = f"{counted(len(tracked.anchors), 'frame')}, {in_runs(doubtful, ids)}"
         notes.append(Note("camera or object", len(doubtful), detail))
     sizes = np.bincount(tracked.piece)
