@@ -189,4 +189,4 @@ def test_an_input_that_is_off_everywhere_is_not_called_optimal(data_dir: Path, t
     model = disturbed(data_dir / "colmap/unsorted_tiny", tmp_path / "off", degrees=8.0, share=0.15)
     done = CliRunner().invoke(app, ["refine", "colmap", str(model), "--out", str(tmp_path / "out")])
     assert isinstance(done.exception, CheckError)
-    assert done.stdout.startswith("verdict  in doubt, since 100% of the observations are more than 4 px off: worse:")
+    assert done.stdout.startswith("verdict  in doubt, since 100% of the observations are more than 4 px off: kept")

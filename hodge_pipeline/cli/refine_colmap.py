@@ -73,7 +73,8 @@ def _print_tables(result: RefinedModel) -> None:
 def _lines(result: RefinedModel, *, alone: bool, verbose: bool) -> list[str]:
     """The result of a model in eight lines of 80 columns, two where there are several; `verbose`: every note, whole."""
     decision = result.decision
-    outcome = "" if decision.outcome in decision.reason else decision.outcome  # "already optimal: …" says it
+    told = decision.outcome in decision.reason  # "already optimal: …" says it
+    outcome = "" if told else {"worse": "kept as given"}.get(decision.outcome, decision.outcome)
     lines = labelled("verdict", ": ".join(filter(None, (decision.doubt, outcome, decision.reason))))
     if verbose or alone:
         lines += [f"  - {measure}" for measure in decision.measures[: len(decision.measures) if verbose else MEASURES]]

@@ -108,8 +108,8 @@ def _without_backbone(graph: ViewGraph, found: Diagnosis, solved: Solver) -> Sol
         weights, final = reweighted(informed, weights, final, solved_with)
     whole = np.zeros(graph.edge_count)
     whole[np.flatnonzero(weights)] = final.weights * weights[np.flatnonzero(weights)]
-    stated_notes = (note for note in stated.notes if note not in final.notes)
-    notes = (*stated_notes, _kept_note(found, whole), *found.notes, *final.notes)
+    earlier = (*stated.notes, _kept_note(found, whole), *found.notes)
+    notes = (*(note for note in earlier if note not in final.notes), *final.notes)
     return _with_confirmation(graph, stated.used, replace(final, weights=whole, notes=notes))
 
 

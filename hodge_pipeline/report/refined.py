@@ -28,8 +28,8 @@ from hodge_pipeline.types.text import counted
 HEADLINES = {
     "refined": "Better than the poses given",
     "optimal": "No significant improvement: the poses given are given back",
-    "worse": "Worse than the poses given: those are given back",
-    "forced": "Worse than the poses given, written all the same",
+    "worse": "Not better than the poses given: those are given back",
+    "forced": "Not better than the poses given, written all the same",
     "convention": "The poses given look to be of another convention: they are given back",
     "nothing": "Nothing could be refined: no poses are written",
 }
