@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hodge_pipeline import se3
 from hodge_pipeline.registration.descriptors import match, root_sift
 from hodge_pipeline.registration.landmarks import find_landmarks
-from hodge_pipeline.registration.pixels import back_project
+from hodge_pipeline.registration.pixels import back_project, project, sound_depth
 from hodge_pipeline.registration.rgbd import Rgbd, guided_match
 from hodge_pipeline.registration.visual import VisualMotion, fit_triples, visual_motion
 from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats, Floats32, Frame, Landmarks, PointCloud
@@ -104,6 +104,21 @@ def test_landmarks_lie_at_the_measured_depth_and_never_on_its_edges():
     depth[:, 1::2] = 3.0
     torn = replace(textured_frame(), read_depth=lambda: depth)
     assert len(find_landmarks(torn, 100, 0.2, 6.0)) == 0
+
+
+def test_no_landmark_lies_beside_what_is_nearer():
+    """It would follow the nearer one's edge; beside what is farther it follows its own."""
+    depth = np.full((480, 640), 2.0, np.float32)
+    depth[:, 320:] = 1.0
+    found = find_landmarks(replace(textured_frame(), read_depth=lambda: depth), 800, 0.2, 6.0)
+    column = project(found.points_in_cam.astype(float), CAMERA)[:, 0]
+    far = found.points_in_cam[:, 2] == 2.0
+    assert column[far].max() < 320 - 6 and column[~far].min() < 320 + 6
+    assert sound_depth(depth, np.array([[316, 240], [300, 240], [324, 240]]), 0.2, 6.0)[1].tolist() == [
+        False,
+        True,
+        True,
+    ]
 
 
 def test_a_faint_texture_gives_landmarks():

@@ -12,6 +12,11 @@ DEPTH_SIGMAS = 2.0
 """Factor on `depth_sigma`, the noise of one pixel on a plane: features and corners lie where depth is worst."""
 EDGE_STEP = 0.03
 """Share of its depth by which the 3x3 pixels about one differ at most: others lie on an edge."""
+BESIDE, NEARER = 7 / 640, 0.06
+"""Share of the image's width, half the window of optical flow, within which nothing may be nearer than a feature by
+this share of its depth: beside an occluder it follows that one's edge, and motions come out short. On two rendered
+videos those of pairs of landmarks are 2.6 % short with such features, 1.4 % without.
+"""
 
 
 def depth_sigma(z_m: Floats) -> Floats:
@@ -34,13 +39,21 @@ def back_project(seen: Floats, camera: Camera) -> Floats:
 
 
 def sound_depth(depth: Floats32, pixels: Ints, min_range_m: float, max_range_m: float) -> tuple[Floats32, Bools]:
-    """The median depth (n,) of the 3x3 pixels around each, and where it is in range and not on an edge."""
-    height, width = depth.shape
-    steps = np.array([(dv, du) for dv in (-1, 0, 1) for du in (-1, 0, 1)])
-    v = np.clip(pixels[:, 1, None] + steps[:, 0], 0, height - 1)
-    u = np.clip(pixels[:, 0, None] + steps[:, 1], 0, width - 1)
-    window = depth[v, u]
+    """The median depth (n,) of the 3x3 pixels around each, and where it is in range, and neither on an edge nor beside
+    what is nearer.
+    """
+    window = _around(depth, pixels, np.arange(-1, 2))
     middle = np.median(window, axis=1)
     in_range = (window.min(axis=1) >= min_range_m) & (window.max(axis=1) <= max_range_m)
     flat = window.max(axis=1) - window.min(axis=1) <= EDGE_STEP * middle
-    return middle.astype(np.float32), np.asarray(in_range & flat)
+    beside = _around(depth, pixels, np.round(BESIDE * depth.shape[1] * np.linspace(-1, 1, 5)).astype(np.int64))
+    occluded = ((beside > 0) & (beside < (1 - NEARER) * middle[:, None])).any(axis=1)
+    return middle.astype(np.float32), np.asarray(in_range & flat & ~occluded)
+
+
+def _around(depth: Floats32, pixels: Ints, steps: Ints) -> Floats32:
+    """The depths (n, k²) at these k steps along rows and columns from each pixel, the image's edge beyond it."""
+    height, width = depth.shape
+    v = np.clip(pixels[:, 1, None] + np.repeat(steps, len(steps)), 0, height - 1)
+    u = np.clip(pixels[:, 0, None] + np.tile(steps, len(steps)), 0, width - 1)
+    return np.asarray(depth[v, u])
