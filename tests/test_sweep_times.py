@@ -24,6 +24,7 @@ from hodge_pipeline.registration.sweeps import (
     deskewed,
     turned,
     turns_by_order,
+    velocities_along,
 )
 from hodge_pipeline.stages import Steps
 from hodge_pipeline.start.sweeps import deskewed_along
@@ -82,8 +83,31 @@ def test_backward_times_of_sweeps_with_given_poses_are_turned_and_named() -> Non
     assert [note.kind for note in notes] == ["times backwards"]
     got, own = made.frames[12].read_points, street()[12].read_points
     assert got is not None and own is not None
-    right = deskewed(own(), np.array([0, 0, 0, SPEED_M_S, 0, 0])).points_in_cam
-    assert np.abs(got().points_in_cam - right).max() < 0.2 < np.abs(own().points_in_cam - right).max()
+    here, behind = true_poses([12, 13])
+    right = deskewed(own(), se3.log(se3.inverse(here) @ behind) / REVOLUTION_S).points_in_cam
+    assert np.abs(got().points_in_cam - right).max() < 0.02 < np.abs(own().points_in_cam - right).max()
+
+
+@pytest.mark.parametrize(("noise_m", "most_m"), [(0.0, 0.01), (0.005, 0.05), (0.1, 0.6)])
+def test_velocities_of_sweeps_are_as_even_as_their_poses_are_noisy(noise_m: float, most_m: float) -> None:
+    """RMS displacement within a sweep at 30 m, of a car that wobbles: medians over a second are 0.26 m off, those of
+    single steps 0.04 and 0.83 m with noise."""
+    times, reach_m = REVOLUTION_S * np.arange(60), 30.0
+    poses = true_poses(np.arange(61))
+    true = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) / REVOLUTION_S
+    noise = np.random.default_rng(0).normal(size=(60, 6)) * np.repeat([np.radians(6.0), 1.0], 3) * noise_m
+    found = velocities_along(poses[:-1] @ se3.exp(noise), times, times + REVOLUTION_S / 2, reach_m)
+    off_m = REVOLUTION_S * (found - true)[:-1] * np.repeat([reach_m, 1.0], 3)
+    assert np.sqrt((off_m**2).sum(axis=1).mean()) < most_m
+
+
+def test_sweeps_take_the_velocity_of_the_time_they_were_measured_in() -> None:
+    times = REVOLUTION_S * np.arange(30)
+    poses = np.tile(np.eye(4), (30, 1, 1))
+    poses[:, 0, 3] = times**2
+    for late_s in (0.0, REVOLUTION_S / 2):
+        found = velocities_along(poses, times, times + late_s, 30.0)[5:-5, 3]
+        np.testing.assert_allclose(found, 2 * (times[5:-5] + late_s), atol=1e-6)
 
 
 @pytest.mark.parametrize(("apart_s", "told"), [(0.1, ["sweeps untimed"]), (30.0, [])])

@@ -16,6 +16,9 @@ STEPS_A_SWEEP = 64
 """Motions that a revolution is cut into: 1.6 cm each at 10 m/s and 10 revolutions a second."""
 FORWARDS, BACKWARDS, UNUSED = 1, -1, 0
 """Senses of the times of points: as told or by their order; the other way; sweeps were deskewed before."""
+HALF_WINDOWS = (0, 1, 2, 5)
+"""Steps on both sides of one whose median is a sweep's velocity: the step alone, to a second, in which cars hardly
+change their speed but hand-held and walking scanners turn to and fro."""
 USUAL_AROUND, FEWEST_STEADY = 10, 8
 """Poses before and after one that tell how evenly a scanner moves there: a second; and poses that it takes to tell."""
 BLOCKS, FEWEST_IN_BLOCK = 128, 4
@@ -114,6 +117,43 @@ def velocities(poses: Floats, times_s: Floats) -> Floats:
     before, behind = np.maximum(here - 1, 0), np.minimum(here + 1, len(poses) - 1)
     moved = se3.log(se3.inverse(poses[before]) @ poses[behind])
     return np.asarray(moved / (times_s[behind] - times_s[before])[:, None])
+
+
+def velocities_along(poses: Floats, times_s: Floats, at_s: Floats, reach_m: float) -> Floats:
+    """The twist a second (N, 6), each in its body's axes, at the times (N,) on a path of noisy poses (N, 4, 4), N > 1.
+
+    The median over the steps around: so many of them that the noise of poses and the change of the velocity, of points
+    `reach_m` away, add up to the least. Independent noise of poses cancels between the mean of three steps or more and
+    its middle one. So they differ by the squared error of the mean and that of one step together.
+    """
+    steps = np.diff(times_s)
+    rates = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) / steps[:, None]
+    lengths = np.repeat([reach_m, 1.0], 3)
+    of_step = 2 * _noise(rates, lengths)
+    errors = [of_step]
+    for half in HALF_WINDOWS[1:]:
+        off = (_windows(rates, half).mean(axis=1) - rates) * lengths
+        errors.append(float(np.median((off**2).sum(axis=1))) - of_step)
+    found = np.median(_windows(rates, HALF_WINDOWS[int(np.argmin(errors))]), axis=1)
+    middles = times_s[:-1] + steps / 2
+    return np.stack([np.interp(at_s, middles, column) for column in found.T], axis=1)
+
+
+def _noise(rates: Floats, lengths: Floats) -> float:
+    """The squared error of poses a step, by third differences of the rates (S, 6): fourth ones of the path, which its
+    motion hardly changes. The squares of 1, 4, 6, 4, 1 add up to 70. Infinite where there are too few.
+    """
+    fourth = np.diff(rates * lengths, 3, axis=0)
+    return float(np.median((fourth**2).sum(axis=1))) / 70 if len(fourth) else float("inf")
+
+
+def _windows(rates: Floats, half: int) -> Floats:
+    """Each rate (S, 6) with `half` ones on both sides: (S, 2 half + 1, 6); itself in place of those beyond an end."""
+    rows = np.arange(len(rates))
+    reach = np.minimum(half, np.minimum(rows, rows[::-1]))
+    offsets = np.arange(-half, half + 1)
+    inside = np.abs(offsets) <= reach[:, None]
+    return np.asarray(rates[rows[:, None] + np.where(inside, offsets, 0)])
 
 
 def turns_by_order(points: Floats32) -> Floats32 | None:

@@ -31,6 +31,7 @@ from hodge_pipeline.registration.sweeps import (
     off_neighbours_m,
     retimed_frame,
     velocities,
+    velocities_along,
 )
 from hodge_pipeline.scene import (
     KeyFrames,
@@ -81,8 +82,6 @@ TOLD = 5
 """Unevenly placed sweeps that are named."""
 AS_TOLD = 0.0, FORWARDS
 """How the times of points are read (`retimed_frame`) where nothing is sure to be better."""
-STEPS_AROUND = 5
-"""Steps before and after a sweep for its median velocity: half a second, in which a car hardly changes its speed."""
 
 
 @plain_dataclass(frozen=True)
@@ -304,24 +303,21 @@ def _jumps(names: list[str], poses: Floats, times_s: Floats, voxel_m: float) -> 
 def deskewed_along(source: Source, world_from_scan: Floats, clouds: CloudOptions, steps: Steps) -> Source:
     """The source with sweeps whose points have times deskewed to their stamps, by velocities from poses (N, 4, 4).
 
-    The poses may be noisy: a velocity is the median over the steps around. Notes where sweeps in motion have no times,
-    or other ones than told.
+    The poses may be noisy, see `velocities_along`. Notes where sweeps in motion have no times, or other ones than told.
     """
     count, stamps, is_untimed = len(source.frames), stamps_of(source), False
     velocity, revolution_s, sense = np.zeros((count, 6)), np.zeros(count), np.ones(count, np.int64)
     for rows in sequences_of(source).values():
         frames = [source.frames[row] for row in rows]
-        if len(rows) < 2 or frames[len(rows) // 2].read_points is None:
+        halfway = frames[len(rows) // 2]
+        if len(rows) < 2 or halfway.read_points is None:
             continue
         turns = is_clock(stamps[rows]) and np.median(np.diff(stamps[rows])) < NO_CLOCK_S
-        look = first_look(frames[len(rows) // 2 :][:1], stamps[rows], clouds)
+        look = first_look([halfway], stamps[rows], clouds)
         if look.turn_s and (turns or not (look.revolution_s and is_clock(stamps[rows]))):
             times = begun_s(stamps[rows], look.turn_s)
-            moved = se3.log(se3.inverse(world_from_scan[rows[:-1]]) @ world_from_scan[rows[1:]])
-            rates = moved / np.diff(times)[:, None]
-            velocity[rows] = [
-                np.median(rates[max(0, row - STEPS_AROUND) : row + STEPS_AROUND], axis=0) for row in range(len(rows))
-            ]
+            middle_s = first_after_s(halfway.read_points(), halfway.stamp_s) + look.turn_s / 2
+            velocity[rows] = velocities_along(world_from_scan[rows], times, times + middle_s, look.reach_m)
             voxel_m = max(look.reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
             revolution_s[rows], sense[rows] = _times_along(frames, velocity[rows], times, clouds, voxel_m, look)
         in_use = revolution_s[rows[0]] > 0 if look.revolution_s else look.turn_s > 0 and sense[rows[0]] != UNUSED
