@@ -10,7 +10,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
 from hodge_pipeline.refine import given_poses
 from hodge_pipeline.refine.given_poses import chi2_measure, first_as_good, spread_corrections
-from hodge_pipeline.refine.guard import Measure, PoseChange, decide
+from hodge_pipeline.refine.guard import Measure, PoseChange, decide, mean_noise
 from hodge_pipeline.refine.path_size import path_size
 from hodge_pipeline.scene import KeyFrames
 from hodge_pipeline.types.notes import Note
@@ -74,6 +74,15 @@ def test_poses_that_the_last_round_still_moved_are_worse(shift_m: float, settled
     measures = given_poses._settled(work, rounds)
     assert (not measures) == settled
     assert decide([BETTER, *measures], MOVED).outcome == ("refined" if settled else "worse")
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_few_pairs_do_not_tell_their_own_noise(count: int) -> None:
+    """Of differences by chance one in 740 exceeds the noise, however few there are; by three standard errors of each
+    sample those of two do once in ten times."""
+    chance = np.random.default_rng(count).standard_normal((4000, count))
+    taken = np.mean([found.mean() > mean_noise(found) for found in chance])
+    assert taken < 0.005
 
 
 def key_frames(count: int) -> tuple[KeyFrames, np.ndarray]:

@@ -17,7 +17,7 @@ from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances
 from hodge_pipeline.pairs.held_out import held_out_pairs
 from hodge_pipeline.refine.against_images import against_images
 from hodge_pipeline.refine.conventions import explained
-from hodge_pipeline.refine.guard import NOISE_SIGMAS, SCORE_TOLERANCE, Decision, Measure, decide
+from hodge_pipeline.refine.guard import SCORE_TOLERANCE, Decision, Measure, decide, mean_noise
 from hodge_pipeline.refine.path_size import path_size
 from hodge_pipeline.refine.uncertainty import mean_chi2, pose_change
 from hodge_pipeline.rounds.one_round import Work
@@ -164,8 +164,7 @@ def _held_out(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
     scores = np.exp(-distances / (scale * SIGMA_M))
     row = 1 + first_as_good(scores[1:])
     scores, distances = scores[[0, row]], distances[[0, row]]
-    error = float((scores[1] - scores[0]).std() / np.sqrt(len(pairs)))
-    tolerance = max(NOISE_SIGMAS * error, SCORE_TOLERANCE)
+    tolerance = max(mean_noise(scores[1] - scores[0]), SCORE_TOLERANCE)
     mean_mm, mean = distances.mean(axis=1) * 1000, scores.mean(axis=1)
     apart = f"{mean_mm[0]:.3g} mm apart before, {mean_mm[1]:.3g} mm after"
     work.steps.note(Note("held out", len(pairs), f"{apart}, the correction at every {KNOTS_APART[row - 1]}. key frame"))

@@ -6,7 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
+import numpy as np
+from scipy.special import ndtr, stdtrit
+
 from hodge_pipeline.evaluation.difference import Better, alike, sign_of
+from hodge_pipeline.types import Floats
 
 SCORE_TOLERANCE = 0.002
 """Least tolerance of a score exp(−d/σ), σ = 69 mm: what 0.14 mm of distance between clouds make."""
@@ -113,6 +117,16 @@ class Decision:
     def exit_code(self) -> int:
         """3 where the result failed its own checks, else 0."""
         return 3 if self.outcome in ("worse", "convention", "nothing") else 0
+
+
+def mean_noise(differences: Floats) -> float:
+    """What chance makes of the mean of paired differences (P,): `NOISE_SIGMAS` standard errors of a normal one, more of
+    few pairs by Student's t, which do not tell their own spread; infinite of a single one.
+    """
+    count = len(differences)
+    if count < 2:
+        return float("inf")
+    return float(-stdtrit(count - 1, ndtr(-NOISE_SIGMAS)) * differences.std(ddof=1) / np.sqrt(count))
 
 
 def decide(measures: Sequence[Measure], change: PoseChange | None = None, *, force: bool = False) -> Decision:
