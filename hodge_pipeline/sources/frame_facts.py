@@ -214,12 +214,13 @@ def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]
     values = np.concatenate(depths) if depths else np.zeros(0)
     valid = values[values > 0]
     median = float(np.median(valid)) if len(valid) else None
-    missing = None
+    missing = dict[str, Any]()
     if with_depth and with_depth[0].read_depth is not None:
         camera, widths = with_depth[0].camera, [frame.camera.width for frame in with_depth if frame.camera is not None]
         width = (max(widths),) if widths else ()
         units = doubts_of(valid, *width)
-        missing = ["source.reader.depth_scale=1000"] if are_millimetres_as_tums(valid, *width) else None
+        if are_millimetres_as_tums(valid, *width):
+            missing = {"missing": ["source.reader.depth_scale=1000"]}
         oddities.extend(str(doubt) for doubt in (*units, *colour_doubts(edges, camera)))
     elif median is not None and not PLAUSIBLE_DEPTH_M[0] < median < PLAUSIBLE_DEPTH_M[1]:
         oddities.append(f"the median distance is {median:.3g} m: are the points in metres?")
@@ -229,8 +230,7 @@ def _depth_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, Any]
         "median depth in metres": median,
         "share without depth": float(1 - len(valid) / len(values)) if len(values) else None,
         "unreadable among them": faults,
-        "missing": missing,
-    }
+    } | missing
 
 
 def _depth(frame: Frame) -> tuple[Floats32, float]:

@@ -90,7 +90,7 @@ def inspect(path: Path, reader: FrameReader | None = None) -> dict[str, Any]:
         facts.pop("missing", None)
     if camera_error is not None:
         facts["cameras"] = ["{}x{}, intrinsics unknown".format(*camera_error.size)]
-        facts["missing"] = [*(facts.get("missing") or ()), f"source.reader.camera={camera_error.camera}"]
+        facts["missing"] = [*facts.get("missing", ()), f"source.reader.camera={camera_error.camera}"]
     if source.trajectory is not None:
         facts["trajectory poses"] = len(source.trajectory)
         if not source.frames and len(source.trajectory):
