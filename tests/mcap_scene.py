@@ -59,7 +59,8 @@ def write_rgbd(
         coded = {"format": colour.media_type.removeprefix("image/"), "data": colour.contents}
         log.add(INFO, CALIBRATION, {**head, **camera_message(frame.camera)}, encoding, log_ns)
         log.add(DEPTH, depth_schema, {**head, **depth_message(stored)}, encoding, log_ns)
-        log.add(COLOUR, COMPRESSED, {**head, **coded}, encoding, log_ns)
+        moment = foxglove_header(stamp_s(frame) + frame.colour_delay_s, OPTICAL)
+        log.add(COLOUR, COMPRESSED, {**moment, **coded}, encoding, log_ns)
         log.add(POSES, "foxglove.PoseInFrame", pose_in_frame(frame), encoding, log_ns)
     return log.write(path, **options)
 
