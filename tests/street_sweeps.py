@@ -16,7 +16,7 @@ import pytest
 
 from hodge_pipeline.demo.street import Road
 from hodge_pipeline.demo.sweeps import FARTHEST_M, REVOLUTION_S, SpinningScanner
-from hodge_pipeline.registration import scan_to_map
+from hodge_pipeline.registration import following
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.start.sweeps import Sweeps, follow
@@ -57,7 +57,7 @@ def warmed_up_once() -> Iterator[None]:
     what following so few sweeps costs.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hodge_pipeline.start.sweeps.first_velocity", once(scan_to_map.first_velocity))
+        patch.setattr("hodge_pipeline.start.sweeps.first_velocity", once(following.first_velocity))
         patch.setattr(JUDGE, lambda _, __, told, ___: told)
         yield
 

@@ -27,7 +27,9 @@ def test_las_files_count_from_the_whole_metres_of_their_middle(tmp_path: Path) -
     assert source.notes == ("coordinates of 2 LAS files are counted from their middle 431006 5401002 121",)
 
 
-def test_las_sweeps_keep_the_scanners_axes_and_the_times_of_their_points(tmp_path: Path) -> None:
+def test_las_sweeps_keep_the_scanners_axes_and_the_times_of_their_points(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, points, times_s = tmp_path / "sweep_0.las", ROOM - [1, 1, 1], np.linspace(7.0, 7.1, len(ROOM))
     source = CloudFolderReader().open(write_las(path, points, times_s=times_s))
     cloud = source.frames[0].read_points()
@@ -36,6 +38,9 @@ def test_las_sweeps_keep_the_scanners_axes_and_the_times_of_their_points(tmp_pat
     assert not source.notes
     minutes = CloudFolderReader().open(write_las(path, points, times_s=100 * times_s))  # no second in milliseconds
     assert minutes.frames[0].read_points().times_s is None
+    monkeypatch.setattr("hodge_adapters.clouds.scan_files.ROWS_IN_PART", len(ROOM) - 1)
+    survey = CloudFolderReader().open(write_las(path, points, times_s=times_s)).frames[0].read_points()
+    assert len(survey) == len(ROOM) and survey.times_s is None
 
 
 def test_each_scan_of_an_e57_is_a_posed_frame(tmp_path: Path) -> None:

@@ -115,15 +115,18 @@ def test_odometry_is_lost_at_a_step_that_free_space_refutes(
     assert all("rows 1 and 2 (surfaces fit" in note for note in found.notes)
 
 
-def test_the_step_of_registration_tells_what_was_seen_through(clouds: CloudSet, tmp_path: Path) -> None:
+def test_the_step_of_registration_tells_what_was_seen_through_and_measures_it_once(
+    clouds: CloudSet, tmp_path: Path
+) -> None:
     clouds.save(tmp_path / "clouds")
     poses = np.tile(np.eye(4), (3, 1, 1))
     with LocalExecutor(workers=0).open() as workers:
-        found = register_edges(
-            Edges.of(PAIRS), CloudSet.open(tmp_path / "clouds"), Gicp(), poses,
-            workers=workers, step=Step(tmp_path, lambda _: None, lambda *_: None),
-        )  # fmt: skip
+        step, stored = Step(tmp_path, lambda _: None, lambda *_: None), CloudSet.open(tmp_path / "clouds")
+        found = register_edges(Edges.of(PAIRS), stored, Gicp(), poses, workers=workers, step=step)
+        marked = found.put([0, 2], seen_through=[0.5, np.nan])
+        kept = register_edges(Edges.of(PAIRS), stored, Gicp(), poses, marked, workers=workers, step=step)
     assert found.seen_through.tolist() == [0.0] * 3
+    assert kept.seen_through.tolist() == [0.5, 0.0, 0.0]
 
 
 def test_a_cloud_of_a_depth_image_knows_its_camera_and_one_of_a_scan_has_none(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.demo.street import Road
 from hodge_pipeline.demo.sweeps import FARTHEST_M, REVOLUTION_S, SpinningScanner
 from hodge_pipeline.evaluation.trajectory import absolute_error
-from hodge_pipeline.registration import scan_to_map
+from hodge_pipeline.registration import following, scan_to_map
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.sweeps import (
     BACKWARDS,
@@ -60,7 +60,7 @@ def warm_up_once() -> Iterator[None]:
 
 @pytest.fixture
 def times_judged(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(JUDGE, scan_to_map.sense_of_times)
+    monkeypatch.setattr(JUDGE, following.sense_of_times)
 
 
 def test_sweeps_of_given_poses_are_deskewed_by_them() -> None:
@@ -171,10 +171,10 @@ def test_times_that_run_backwards_or_are_of_deskewed_points_are_told_by_the_poin
     for clouds, sense in ((right, FORWARDS), ([turned(cloud) for cloud in right], BACKWARDS), (flat, UNUSED)):
         given = [(row, row * REVOLUTION_S, cloud) for row, cloud in enumerate(clouds)]
         placed.clear()
-        assert scan_to_map.sense_of_times(0.5, velocity, FORWARDS, given) == sense
+        assert following.sense_of_times(0.5, velocity, FORWARDS, given) == sense
         assert (len(placed) < 2 * len(given)) == (clouds is right)  # no more are asked once they are surely worse
         if clouds is right:  # as of times by the order of points
-            assert scan_to_map.sense_of_times(0.5, velocity, UNUSED, given) == sense
+            assert following.sense_of_times(0.5, velocity, UNUSED, given) == sense
 
 
 def test_the_order_of_points_tells_how_a_scanner_spun_and_no_other_order_does() -> None:

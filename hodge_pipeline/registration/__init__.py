@@ -5,5 +5,5 @@
   `assessment` says what each found is worth; `in_units` has them serve other units.
 - Registration without a guess: `global_*`, `consensus`, `colour_evidence`.
 - Many pairs: `pairs`, as a step `register`; which become edges: `acceptance`, `sliding`, `odometry_path`.
-- Sequences: `odometry` with `gaps`; `tracking`, a package; scans by `scan_to_map` and `sweeps`.
+- Sequences: `odometry` with `gaps`; `tracking`, a package; scans by `scan_to_map`, `following` and `sweeps`.
 """

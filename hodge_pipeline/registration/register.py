@@ -62,7 +62,9 @@ def register_edges(
         columns = {name: getattr(earlier, name)[known] for name in REGISTERED}
         kept = replace(kept, status=np.full(len(rows), USED), **columns)
     every = Edges.joined([found, kept]).select(np.argsort(np.concatenate([missing, rows])))
-    return Edges.joined([with_seen_through(every, clouds, scale), edges.select(held_out)])
+    unseen = np.flatnonzero(np.isnan(every.seen_through))  # what was kept has it, but for pairs of a start
+    seen = with_seen_through(every.select(unseen), clouds, scale).seen_through
+    return Edges.joined([every.put(unseen, seen_through=seen), edges.select(held_out)])
 
 
 def keep_block(folder: Path, block: int, result: Edges) -> None:

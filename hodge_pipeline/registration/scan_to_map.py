@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ import small_gicp
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.assessment import MIN_POINTS
-from hodge_pipeline.registration.sweeps import BACKWARDS, FORWARDS, UNUSED, deskewed, retimed
+from hodge_pipeline.registration.sweeps import deskewed
 from hodge_pipeline.types import Floats, Floats32, Ints, PointCloud
 
 START_LEVELS, LEVELS = (9, 3, 1), (3, 1)
@@ -51,17 +51,6 @@ ACCELERATION_M_S2, FASTEST_M_S = 5.0, 30.0
 SHARED_ERRORS = 30.0
 """Factor on the sigma of a pose that independent points would give: points of a ring or wall share their errors. In a
 simulated corridor steps of 16 beams scattered by 0.1 m and claimed 3 mm.
-"""
-MOST_PASSES = 4
-"""Passes over the first sweeps, forwards and backwards, for their velocity, at most."""
-SURE, FEWEST_TIMED = 4.0, 10
-"""Standard errors by which more points lie on the map by other times than those told, over as many sweeps and more,
-before these are taken. Times by the order of points reach 9.5 in 28 simulated sequences as measured, 0.2 in the same
-deskewed before.
-"""
-WORSE = 2.0
-"""Standard errors by which fewer points lie on the map by other times than those told before no more sweeps are asked:
-sweeps that wrong times blur take longest. Of 178 judgements of simulated and real sequences it changes none.
 """
 MOST_DESKEWS, FARTHER = 3, 0.9
 """A sweep is deskewed again while its new velocity moves its farther points, at this quantile, by half a voxel."""
@@ -178,116 +167,6 @@ def _kalman_update(predicted: Floats, spread_m2: Floats, aligned: Floats, inform
     both = information + known
     moved = np.asarray(np.linalg.solve(both, information @ se3.log(se3.inverse(predicted) @ aligned)))
     return predicted @ se3.exp(moved), np.asarray(np.linalg.inv(both)[3:, 3:])
-
-
-def followed(tracker: ScanToMap, sweeps: Iterable[tuple[int, float, PointCloud]]) -> Iterator[tuple[int, Step | None]]:
-    """Each sweep's row and where it is; None for one that is strange where the next one fits again, or the last.
-
-    Of sweeps, with row and time, two strange ones in a row are a scene that changed, and join the map.
-    """
-    held: tuple[int, float, PointCloud] | None = None
-    for row, time_s, cloud in sweeps:
-        step = tracker.place(cloud, time_s)
-        if tracker.is_strange(step):
-            if held is None:
-                held = (row, time_s, cloud)
-                continue
-            tracker.accept(first := tracker.place(held[2], held[1]))
-            yield held[0], first
-            step = tracker.place(cloud, time_s)
-        elif held is not None:
-            yield held[0], None
-        held = None
-        tracker.accept(step)
-        yield row, step
-    if held is not None:
-        yield held[0], None
-
-
-def first_velocity(voxel_m: float, sweeps: Sequence[tuple[int, float, PointCloud]]) -> tuple[Floats, frozenset[int]]:
-    """The twist per second (6,) at the first of these sweeps, each with its row and time: tracked forwards and
-    backwards until it converges. The rows of strange ones among the first, which only the way back can tell, unless all
-    of the first are: these are a scene that changed.
-
-    A first pass from rest gives too small a velocity, since rings on the ground look the same ahead. It has converged
-    where one end of the sweeps has the velocity that it had before: each pass depends on the one that it begins with.
-    """
-    ends: list[Floats] = [np.zeros(6)]  # in turn at the first and at the last of the sweeps
-    early, strange = {row for row, _, _ in sweeps[: FEWEST_USUAL + 1]}, frozenset[int]()
-    while len(sweeps) > 1 and len(ends) <= 2 * MOST_PASSES:
-        tracker = ScanToMap(voxel_m, ends[-1], START_LEVELS, START_SAMPLE_M)
-        if len(ends) % 2:
-            for _, time_s, cloud in (sweep for sweep in sweeps if sweep[0] not in strange):
-                tracker.follow(cloud, time_s)
-        else:
-            strange = _strange_at_end(tracker, sweeps[::-1], early)
-        ends.append(tracker.velocity)
-        step_m = np.linalg.norm((ends[-1] - ends[max(0, len(ends) - 3)])[3:]) * (sweeps[1][1] - sweeps[0][1])
-        if len(ends) > 2 and step_m < voxel_m / 2:
-            break
-    return ends[(len(ends) - 1) // 2 * 2], strange
-
-
-def _strange_at_end(
-    tracker: ScanToMap, sweeps: Sequence[tuple[int, float, PointCloud]], last: set[int]
-) -> frozenset[int]:
-    """Those of the last rows of sweeps that are strange to the sweeps before them; none where all of these are."""
-    for _ in followed(tracker, (sweep for sweep in sweeps if sweep[0] not in last)):
-        pass
-    strange, ends = set[int](), [sweep for sweep in sweeps if sweep[0] in last]
-    for row, time_s, cloud in ends:
-        step = tracker.place(cloud, time_s)
-        if tracker.is_strange(step):
-            strange.add(row)
-        else:
-            tracker.accept(step)
-    if len(strange) < len(ends):
-        return frozenset(strange)
-    for _, time_s, cloud in ends:
-        tracker.follow(cloud, time_s)
-    return frozenset()
-
-
-def sense_of_times(voxel_m: float, velocity: Floats, told: int, sweeps: Sequence[tuple[int, float, PointCloud]]) -> int:
-    """The sense of the times of points in these sweeps, which began with this velocity: `told`, unless surely more
-    points lie on the map by another: right times put points where they were, wrong ones blur it.
-    """
-    if len(sweeps) < FEWEST_TIMED:
-        return told
-
-    def on_map(sense: int) -> Iterator[float]:
-        return _shares(voxel_m, velocity, ((row, at, retimed(cloud, 0.0, sense)) for row, at, cloud in sweeps))
-
-    nearest = UNUSED if told == FORWARDS else FORWARDS
-    shares: dict[int, list[float]] = {told: [], nearest: []}
-    for of_told, of_nearest in zip(on_map(told), on_map(nearest), strict=True):
-        shares[told].append(of_told)
-        shares[nearest].append(of_nearest)
-        if _gain(shares[nearest], shares[told])[1] < -WORSE:
-            return told
-    if _gain(shares[nearest], shares[told])[0] > 0:  # else what skews points the other way fits less still
-        shares[BACKWARDS] = list(on_map(BACKWARDS))
-    best = max(shares, key=lambda sense: float(np.nanmean(shares[sense])))
-    return best if _gain(shares[best], shares[told])[1] > SURE else told
-
-
-def _gain(shares: list[float], of_told: list[float]) -> tuple[float, float]:
-    """Mean by which the shares of sweeps are greater, and this in its standard errors; 0 where too few tell."""
-    gain = np.subtract(shares, of_told)
-    gain = gain[np.isfinite(gain)]
-    if len(gain) < FEWEST_USUAL:
-        return 0.0, 0.0
-    mean = float(gain.mean())
-    return mean, mean / max(float(gain.std(ddof=1)) / np.sqrt(len(gain)), 1e-12)
-
-
-def _shares(voxel_m: float, velocity: Floats, sweeps: Iterable[tuple[int, float, PointCloud]]) -> Iterator[float]:
-    """The share of points on the map of each sweep but the first two, which have no map of sweeps placed yet."""
-    tracker = ScanToMap(voxel_m, velocity)
-    for number, (_, time_s, cloud) in enumerate(sweeps):
-        tracker.accept(step := tracker.place(cloud, time_s))
-        if number >= 2:
-            yield step.on_map
 
 
 def _usual(shares: deque[float]) -> float:

@@ -18,10 +18,11 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.registration.cloud_set import shortened
 from hodge_pipeline.registration.clouds import CloudOptions, Oddity
+from hodge_pipeline.registration.following import first_velocity, followed, sense_of_times
 from hodge_pipeline.registration.gaps import told_gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, OdometryOptions, chained
 from hodge_pipeline.registration.pairs import register_pairs
-from hodge_pipeline.registration.scan_to_map import ScanToMap, first_velocity, followed, sense_of_times
+from hodge_pipeline.registration.scan_to_map import ScanToMap
 from hodge_pipeline.registration.sweeps import (
     BACKWARDS,
     FORWARDS,

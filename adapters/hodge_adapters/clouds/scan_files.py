@@ -26,6 +26,7 @@ MAX_POINTS_A_BYTE, ALWAYS_POINTS = 4, 1 << 20
 each byte of a file, past the first million, are no scan."""
 
 LAS_TIME = "gps_time"
+"""Read of files of one part at most: no sweep has more points, and the times of a survey take as much as these."""
 LAS_HEADER, LAS_14_HEADER = 227, 375
 """Bytes of the public header of LAS 1.2 and 1.4 (ASPRS LAS 1.4 R15, tables 3 and 20)."""
 RECORD_HEADER, EXTENDED_RECORD_HEADER = 54, 60
@@ -87,7 +88,8 @@ def las_parts(path: Path) -> Iterator[Columns]:
     """The points of a LAS or LAZ file as columns, in parts."""
     with _named(path, "laspy"), _opened_las(path) as file:
         _check_points(path, file.header.point_count)
-        yield from map(_las_columns, _las_chunks(file))
+        is_sweep = file.header.point_count <= ROWS_IN_PART
+        yield from (_las_columns(part, is_sweep) for part in _las_chunks(file))
 
 
 def _opened_las(path: Path) -> Any:
@@ -109,8 +111,9 @@ def _las_chunks(file: Any) -> Iterator[Any]:
     yield from file.chunk_iterator(ROWS_IN_PART)
 
 
-def _las_columns(part: Any) -> Columns:
-    names = (*"xyz", *({*COLOURS, LAS_TIME} & {*part.point_format.dimension_names}))
+def _las_columns(part: Any, is_sweep: bool) -> Columns:
+    wanted = (*COLOURS, LAS_TIME) if is_sweep else COLOURS
+    names = (*"xyz", *({*wanted} & {*part.point_format.dimension_names}))
     return {name: np.asarray(part[name]) for name in names}
 
 
