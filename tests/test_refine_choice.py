@@ -14,7 +14,7 @@ from hodge_pipeline.refine.candidates import CandidateModel, CandidateSet
 from hodge_pipeline.refine.choice import UNTOLD, Choice, choose, refused_doubt
 from hodge_pipeline.refine.model import _metric_poses
 from hodge_pipeline.refine.reprojection_cost import costs
-from hodge_pipeline.refine.uncertainty import loose, told_apart
+from hodge_pipeline.refine.uncertainty import likeliest, loose, told_apart
 from hodge_pipeline.types import Floats, ModelQuality
 from hodge_pipeline.types.pose_information import PoseInformation
 from test_reprojection_cost import flat, quality
@@ -158,6 +158,16 @@ def test_poses_that_are_all_off_are_mended_though_one_link_is_loose_and_not_move
     assert np.median(all_moved.information.standard_errors[:, 1]) > 0.9, "most are known less well than they moved"
     models: Any = start, all_moved, halves_moved
     assert told_apart(*models[:2]) and not told_apart(*models[::2])
+
+
+def test_most_likely_poses_are_those_of_the_tracks_and_along_a_loose_link_those_of_the_start() -> None:
+    """The start is noisy and one of its poses was carried away; the halves of the model were shifted by 0.9."""
+    given = quality(flat(1.0, images=10, count=40))
+    noise = np.random.default_rng(0).normal(scale=0.1, size=(10, 6))
+    noise[2, 4] = 50.0
+    models: Any = Row(given), Row(given, shifted=0.9)
+    y = likeliest(models[0].world_from_body @ se3.exp(noise), models[1])[:, 1, 3]
+    assert np.ptp(y[:5]) < 0.1 and np.ptp(y[5:]) < 0.1 and abs(y[5:].mean() - y[:5].mean()) < 0.4
 
 
 def test_candidates_are_laid_on_the_clouds_in_metres_each_by_its_own_depth() -> None:

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.refine.frame import in_frame_of
+from hodge_pipeline.refine.frame import in_frame_of, parts_laid_on
 from hodge_pipeline.refine.model_edges import DepthEdges, depth_edges, no_depth_edges
 from hodge_pipeline.refine.model_options import ModelRefinement
 from hodge_pipeline.refine.model_solve import Solved, position_priors, solve_bodies
-from hodge_pipeline.refine.reprojection_cost import SAME_COST, ReprojectionCost, best, costs, mends
-from hodge_pipeline.refine.uncertainty import told_apart
+from hodge_pipeline.refine.reprojection_cost import LEAST_CAP_PX, SAME_COST, ReprojectionCost, best, costs, mends
+from hodge_pipeline.refine.uncertainty import likeliest, told_apart
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.types import Bools, Floats, PositionPriors, ViewGraph
 from hodge_pipeline.types.tracked_model import TrackedModel
@@ -25,6 +25,7 @@ RESECTED = "resection and bundle adjustment"
 ROBUST, ROBUST_POINTS = "resection and robust bundle adjustment", "robust bundle adjustment of points alone"
 AFTER_ROBUST = "bundle adjustment without a robust loss from there"
 CONSISTENT, MENDED = "consistent poses and bundle adjustment", "images that are off placed anew and bundle adjustment"
+PARTS_LAID = "bundle adjustment of parts laid on the input"
 MOST_RESECTIONS = 3
 """Rounds of resecting doubtful images: one that is placed well gives points that its neighbours are placed by."""
 NO_EDGE = "no edge was found: no two images share enough points, matches or depth (model.min_shared)"
@@ -88,7 +89,7 @@ class _Candidates:
     def __init__(self, inputs: Sequence[TrackedModel], start: TrackedModel, steps: Steps) -> None:
         self._inputs, self._steps = [model.quality for model in inputs], steps
         self.candidates, self.notes = [CandidateModel(GIVEN, start, holds_poses=True)], list[str]()
-        self._start, self._known = start, start.known_positions
+        self._start, self._known, self._lies = start, start.known_positions, start.world_from_body
         self.update_costs()
 
     def update_costs(self) -> None:
@@ -135,6 +136,12 @@ class _Candidates:
         _, before, after = costs(self._inputs, [held, model.quality])
         return not before.is_sound and mends(before, after) and told_apart(self._start, model)
 
+    def lay_parts_by(self, resected: Floats) -> None:
+        """Lay parts by these poses (B, 4, 4) of the start's points where most observations fit these alone."""
+        errors_px = [np.median(self._start.moved(poses).quality.errors_px) for poses in (self._lies, resected)]
+        if errors_px[1] <= LEAST_CAP_PX < errors_px[0]:
+            self._lies = resected
+
     def add(
         self,
         name: str,
@@ -158,10 +165,30 @@ class _Candidates:
         adjusted = model.read_back(found.folder, found.notes)
         if move_bodies and self._known is None:
             adjusted = in_frame_of(self._start, adjusted)
+            if priors is None:
+                found, adjusted = self._with_parts_laid(found, adjusted)
         self._steps.remember(adjusted, self._steps.key(found))
         at = len(self.candidates) if row is None else row
         self.candidates.insert(at, CandidateModel(name, adjusted, not move_bodies, found.has_converged))
         self.update_costs()
+
+    def _with_parts_laid(self, found: AdjustedModel, adjusted: TrackedModel) -> tuple[AdjustedModel, TrackedModel]:
+        """The same, its parts laid on the start, adjusted once more, and laid on the most likely poses; as it is, with
+        a note, where that adjustment fails.
+
+        A shared point or two tell some of how parts lie: more than a start that is far off, less than one that is near.
+        """
+        laid = parts_laid_on(self._lies, adjusted)
+        if laid is adjusted:
+            return found, adjusted
+        self._steps.remember(laid, self._steps.key([self._start, found, PARTS_LAID]))
+        try:
+            again = self._steps.step(adjusted_model, laid, None, None, title=PARTS_LAID)
+        except SourceError as error:
+            self.notes.append(f"{PARTS_LAID}: {error}")
+            return found, adjusted
+        adjusted = in_frame_of(self._start, laid.read_back(again.folder, again.notes))
+        return again, parts_laid_on(likeliest(self._lies, adjusted), adjusted)
 
 
 def make_candidates(
@@ -180,6 +207,7 @@ def make_candidates(
     poses = None
     if not found.costs[0].is_sound:
         poses = steps.step(resected, start, None, title="resection")
+        found.lay_parts_by(poses)
         found.add(RESECTED, start, poses, whole_steps=True)
     if not found.is_mended:
         found.add(ADJUSTED, start, row=1)

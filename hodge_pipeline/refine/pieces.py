@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.sparse import csr_array
 
@@ -26,6 +28,33 @@ def apart_from_largest(model: TrackedModel) -> Bools:
     """Bodies (B,) that points do not tie to the largest piece: with fewer than `LEAST_SHARED` points that other bodies
     see, in a piece of their own, or in a group that shares fewer with all others, as two rows that one point joins.
     """
+    found = _tied(model)
+    largest_piece = found.piece == np.argmax(np.bincount(found.piece, found.enough))
+    largest_group = found.group == np.argmax(np.bincount(found.group, found.enough))
+    return np.asarray(~found.enough | ~largest_piece | (found.loose & ~largest_group))
+
+
+def parts(model: TrackedModel) -> Ints:
+    """The part (B,) of each body: groups that share fewer than `LEAST_SHARED` points with all others are each one, as
+    is what else of a piece hangs together; −1 of bodies that see too few points with others.
+    """
+    found = _tied(model)
+    kinds = np.stack([found.piece, np.where(found.loose, found.group, -1)], axis=1)[found.enough]
+    out = np.full(len(found.enough), -1)
+    out[found.enough] = np.unique(kinds, axis=0, return_inverse=True)[1].ravel()
+    return out
+
+
+class _Tied(NamedTuple):
+    """Of each body (B,): whether it sees enough points with others, its piece, its group, and whether this is loose."""
+
+    enough: Bools
+    piece: Ints
+    group: Ints
+    loose: Bools
+
+
+def _tied(model: TrackedModel) -> _Tied:
     quality, count = model.quality, len(model.body_names)
     seen = np.unique(np.stack([model.body_of_frame[quality.keypoints[:, 0]], quality.point_rows], axis=1), axis=0)
     while True:
@@ -36,10 +65,8 @@ def apart_from_largest(model: TrackedModel) -> Bools:
             break
         seen = seen[kept]
     piece = connected_components(seen + np.array([0, count]), count + quality.points)[:count]
-    sizes = np.bincount(piece, enough)
     group, ties = _groups(seen, (count, quality.points))
-    largest = group == np.argmax(np.bincount(group, enough))
-    return np.asarray(~enough | (piece != np.argmax(sizes)) | ((ties < LEAST_SHARED)[group] & ~largest))
+    return _Tied(enough, piece, group, (ties < LEAST_SHARED)[group])
 
 
 def _groups(seen: Ints, shape: tuple[int, int]) -> tuple[Ints, Ints]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.chi2 import chi2_by_information
+from hodge_pipeline.complex.chi2 import MEDIAN_CHI2, chi2_by_information, tail_weight
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.refine.guard import PoseChange
 from hodge_pipeline.solvers.covariance import marginal_covariances
@@ -77,6 +77,26 @@ def told_apart(start: TrackedModel, model: TrackedModel) -> bool:
         open_to_doubt = np.eye(size) + group * np.outer(part, part) / nearer**2
         gain -= 2.0 * float(own @ np.linalg.solve(open_to_doubt, own))
     return gain > 0
+
+
+def likeliest(start: Floats, model: TrackedModel) -> Floats:
+    """The most likely poses (B, 4, 4) by the model's tracks and by poses at the start (B, 4, 4), in its frame.
+
+    The errors at the start follow Student's t, of sizes that the move tells. Those poses alone where bodies are so many
+    that each one's information is given all others.
+    """
+    told = model.information
+    if len(told.groups) != 1:
+        return start
+    poses = model.world_from_body.copy()
+    moved = _motions(start[told.fixed], poses[told.fixed])
+    squares = (moved.reshape(-1, 2, 3) ** 2).sum(axis=2)
+    usual = np.maximum(np.median(squares, axis=0) / MEDIAN_CHI2[3], np.finfo(float).eps ** 2)
+    scale = np.repeat(np.sqrt(usual / tail_weight(squares / usual, 3)), 3, axis=1).ravel()
+    open_to_start = np.eye(len(scale)) + told.groups[0] * np.outer(scale, scale)
+    back = scale * np.linalg.solve(open_to_start, moved.ravel() / scale)
+    poses[told.fixed] = poses[told.fixed] @ se3.exp(-back.reshape(-1, 6))
+    return poses
 
 
 def _without_gauge(moved: Floats, world_from_body: Floats, scale: Floats) -> Floats:

@@ -83,6 +83,11 @@ class TrackedModel(Protocol):
     def scaled(self, factor: float, motion: Floats | None = None) -> TrackedModel:
         """The model in another unit of length, then moved as a whole by `motion` (4, 4)."""
 
+    def scaled_parts(self, part: Ints, factors: Floats, motions: Floats) -> TrackedModel:
+        """The same of each part (B,) of the bodies, with the points they see, by its own factor (G,) and motion (G, 4,
+        4); a point of several parts is where their rays then meet.
+        """
+
     def placed(self) -> TrackedModel:
         """The model in the world of positions that are known of its images; as it is where none are."""
 

@@ -246,13 +246,33 @@ class ColmapModel:
         copy.transform(pycolmap.Sim3d(factor, pycolmap.Rotation3d(moved[:3, :3]), moved[:3, 3]))
         return self._of_content(copy, refreshed(before, copy, se3.transform(moved, factor * before.points.xyz)))
 
+    def scaled_parts(self, part: Ints, factors: Floats, motions: Floats) -> ColmapModel:
+        """Positions of each part times its factor, then moved; points of several parts where their rays meet."""
+        points, row = self.records.points, part[self.bodies.body_of_image[self.records.image_rows]]
+        poses = self.world_from_body.copy()
+        poses[:, :3, 3] *= factors[part, None]
+        poses = motions[part] @ poses
+        of_point = np.zeros(len(points.ids), np.int64)
+        np.maximum.at(of_point, points.owners, row)
+        several = np.bincount(points.owners, row != of_point[points.owners], len(of_point)) > 0
+        xyz = se3.transform(motions[of_point], factors[of_point, None, None] * points.xyz[:, None])[:, 0]
+        xyz[several] = self._where_rays_meet(poses)[several]
+        return self._at(poses, xyz)
+
     def moved(self, world_from_body: Floats) -> ColmapModel:
         """Bodies at these poses, points where their rays meet; what the database matched is merged where it fits."""
+        return self._at(world_from_body, self._where_rays_meet(world_from_body))
+
+    def _where_rays_meet(self, world_from_body: Floats) -> Floats:
+        """Where points (P, 3) are with the bodies at these poses."""
+        return points_of_rays(self.records, world_from_body[self.bodies.body_of_image] @ self.bodies.body_from_cam)
+
+    def _at(self, world_from_body: Floats, xyz: Floats) -> ColmapModel:
+        """Bodies at these poses, points at these positions (P, 3)."""
         before, copy = self.records, self._copy()
         for frame_id, pose in zip(self.bodies.frame_ids, world_from_body, strict=True):
             copy.frames[frame_id].rig_from_world = pycolmap.Rigid3d(np.ascontiguousarray(se3.inverse(pose)[:3]))
-        poses = world_from_body[self.bodies.body_of_image] @ self.bodies.body_from_cam
-        points, xyz = copy.points3D, points_of_rays(before, poses)
+        points = copy.points3D
         for point_id, place in zip(before.points.ids.tolist(), xyz, strict=True):
             points[point_id].xyz = place
         update_errors(copy)
