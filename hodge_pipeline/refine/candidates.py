@@ -89,7 +89,7 @@ class _Candidates:
     def __init__(self, inputs: Sequence[TrackedModel], start: TrackedModel, steps: Steps) -> None:
         self._inputs, self._steps = [model.quality for model in inputs], steps
         self.candidates, self.notes = [CandidateModel(GIVEN, start, holds_poses=True)], list[str]()
-        self._start, self._known, self._lies = start, start.known_positions, start.world_from_body
+        self._start, self._known, self._lays_parts = start, start.known_positions, True
         self.update_costs()
 
     def update_costs(self) -> None:
@@ -136,11 +136,14 @@ class _Candidates:
         _, before, after = costs(self._inputs, [held, model.quality])
         return not before.is_sound and mends(before, after) and told_apart(self._start, model)
 
-    def lay_parts_by(self, resected: Floats) -> None:
-        """Lay parts by these poses (B, 4, 4) of the start's points where most observations fit these alone."""
-        errors_px = [np.median(self._start.moved(poses).quality.errors_px) for poses in (self._lies, resected)]
-        if errors_px[1] <= LEAST_CAP_PX < errors_px[0]:
-            self._lies = resected
+    def leave_parts_near(self, resected: Floats) -> None:
+        """Lay no parts where most observations fit these poses (B, 4, 4) of the start's points, and not the start's.
+
+        An adjustment from these leaves parts where the points tell, and the start's poses are far off.
+        """
+        own = self._start.world_from_body
+        errors_px = [np.median(self._start.moved(poses).quality.errors_px) for poses in (own, resected)]
+        self._lays_parts = not errors_px[1] <= LEAST_CAP_PX < errors_px[0]
 
     def add(
         self,
@@ -165,7 +168,7 @@ class _Candidates:
         adjusted = model.read_back(found.folder, found.notes)
         if move_bodies and self._known is None:
             adjusted = in_frame_of(self._start, adjusted)
-            if priors is None:
+            if self._lays_parts and priors is None:
                 found, adjusted = self._with_parts_laid(found, adjusted)
         self._steps.remember(adjusted, self._steps.key(found))
         at = len(self.candidates) if row is None else row
@@ -178,7 +181,7 @@ class _Candidates:
 
         A shared point or two tell some of how parts lie: more than a start that is far off, less than one that is near.
         """
-        laid = parts_laid_on(self._lies, adjusted)
+        laid = parts_laid_on(self._start.world_from_body, adjusted)
         if laid is adjusted:
             return found, adjusted
         self._steps.remember(laid, self._steps.key([self._start, found, PARTS_LAID]))
@@ -188,7 +191,7 @@ class _Candidates:
             self.notes.append(f"{PARTS_LAID}: {error}")
             return found, adjusted
         adjusted = in_frame_of(self._start, laid.read_back(again.folder, again.notes))
-        return again, parts_laid_on(likeliest(self._lies, adjusted), adjusted)
+        return again, parts_laid_on(likeliest(self._start.world_from_body, adjusted), adjusted)
 
 
 def make_candidates(
@@ -207,7 +210,7 @@ def make_candidates(
     poses = None
     if not found.costs[0].is_sound:
         poses = steps.step(resected, start, None, title="resection")
-        found.lay_parts_by(poses)
+        found.leave_parts_near(poses)
         found.add(RESECTED, start, poses, whole_steps=True)
     if not found.is_mended:
         found.add(ADJUSTED, start, row=1)
