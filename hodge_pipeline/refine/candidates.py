@@ -89,7 +89,7 @@ class _Candidates:
     def __init__(self, inputs: Sequence[TrackedModel], start: TrackedModel, steps: Steps) -> None:
         self._inputs, self._steps = [model.quality for model in inputs], steps
         self.candidates, self.notes = [CandidateModel(GIVEN, start, holds_poses=True)], list[str]()
-        self._start, self._known, self._lays_parts = start, start.known_positions, True
+        self._start, self._known, self._lays_parts = start, start.known_positions, False
         self.update_costs()
 
     def update_costs(self) -> None:
@@ -136,14 +136,13 @@ class _Candidates:
         _, before, after = costs(self._inputs, [held, model.quality])
         return not before.is_sound and mends(before, after) and told_apart(self._start, model)
 
-    def leave_parts_near(self, resected: Floats) -> None:
-        """Lay no parts where most observations fit these poses (B, 4, 4) of the start's points, and not the start's.
+    def decide_on_parts(self, resected: Floats) -> None:
+        """Lay parts where most observations fit neither the start nor these poses (B, 4, 4) of its points.
 
-        An adjustment from these leaves parts where the points tell, and the start's poses are far off.
+        An adjustment that begins near an optimum leaves parts where they were; one that goes far moves them at will.
         """
-        own = self._start.world_from_body
-        errors_px = [np.median(self._start.moved(poses).quality.errors_px) for poses in (own, resected)]
-        self._lays_parts = not errors_px[1] <= LEAST_CAP_PX < errors_px[0]
+        models = self._start, self._start.moved(resected)
+        self._lays_parts = all(np.median(one.quality.errors_px) > LEAST_CAP_PX for one in models)
 
     def add(
         self,
@@ -210,7 +209,7 @@ def make_candidates(
     poses = None
     if not found.costs[0].is_sound:
         poses = steps.step(resected, start, None, title="resection")
-        found.leave_parts_near(poses)
+        found.decide_on_parts(poses)
         found.add(RESECTED, start, poses, whole_steps=True)
     if not found.is_mended:
         found.add(ADJUSTED, start, row=1)
