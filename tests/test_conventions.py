@@ -32,6 +32,7 @@ WRITTEN = {
     "quaternions with w first": w_first,
     "OpenGL's": lambda poses: poses @ np.diag([1.0, -1, -1, 1]),
     "a robot": lambda poses: poses @ se3.inverse(ROBOT_FROM_CAM),
+    "beside a scanner": lambda poses: poses @ ROBOT_FROM_CAM,
     "camera from world": se3.inverse,
     "millimetres": lambda poses: se3.rescaled(poses, 1000),
     "all have the same rotation": without_turns,

@@ -53,6 +53,12 @@ READINGS = (
         "poses of a robot, x ahead and z up",
         "give those of the camera: world_from_robot @ robot_from_cam",
     ),
+    Reading(
+        lambda poses: np.asarray(poses @ se3.inverse(ROBOT_FROM_CAM)),
+        "poses of a camera, z ahead and y down, beside a scanner with x ahead and z up",
+        "give those of the scanner: world_from_cam @ cam_from_scanner (KITTI's Tr; if only turned, "
+        "[[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])",
+    ),
     Reading(se3.inverse, "inverse poses, camera from world", "invert each"),
     Reading(lambda poses: se3.rescaled(poses, 1e-3), "lengths in millimetres", "divide them by 1000"),
 )
