@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -153,6 +154,25 @@ def test_a_turn_from_the_first_sweep_on_is_followed() -> None:
     assert absolute_error(found.world_from_scan, exact).max_m < NEAR_M
 
 
+@cache
+def fast_street() -> list[PointCloud]:
+    """Revolutions at 20 m/s."""
+    scanner = SpinningScanner(Road(20.0), 0, beams=16, columns=360, noise=1.0)
+    return [PointCloud(sweep.points, times_s=sweep.times_s) for sweep in map(scanner.sweep, range(12))]
+
+
+def test_sweeps_that_leave_the_motion_loose_judge_no_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a narrow field in a corridor: paths slide, and points lie on the map by chance."""
+    given = [(row, row * REVOLUTION_S, turned(cloud)) for row, cloud in enumerate(fast_street())]
+    place = scan_to_map.ScanToMap.place
+
+    def loose(tracker: scan_to_map.ScanToMap, cloud: PointCloud, time_s: float) -> scan_to_map.Step:
+        return place(tracker, cloud, time_s)._replace(is_loose=time_s > 0.7)
+
+    monkeypatch.setattr(scan_to_map.ScanToMap, "place", loose)
+    assert following.sense_of_times(0.5, np.array([0, 0, 0, 20.0, 0, 0]), FORWARDS, given) == FORWARDS
+
+
 def test_times_that_run_backwards_or_are_of_deskewed_points_are_told_by_the_points_on_the_map(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -164,8 +184,7 @@ def test_times_that_run_backwards_or_are_of_deskewed_points_are_told_by_the_poin
         return place(tracker, cloud, time_s)
 
     monkeypatch.setattr(scan_to_map.ScanToMap, "place", counted)
-    scanner = SpinningScanner(Road(20.0), 0, beams=16, columns=360, noise=1.0)
-    right = [PointCloud(sweep.points, times_s=sweep.times_s) for sweep in map(scanner.sweep, range(12))]
+    right = fast_street()
     velocity = np.array([0, 0, 0, 20.0, 0, 0])
     flat = [replace(cloud, points_in_cam=deskewed(cloud, velocity).points_in_cam) for cloud in right]
     for clouds, sense in ((right, FORWARDS), ([turned(cloud) for cloud in right], BACKWARDS), (flat, UNUSED)):
