@@ -33,7 +33,8 @@ from hodge_pipeline.types.tracked_model import TrackedModel
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 Advance = Callable[[int], None]
-"""Called with the number of units just finished; a stage's one duty towards a progress bar."""
+"""Called with the number of units just finished; a stage's one duty towards a progress bar. Negative where they are
+done again."""
 
 
 def no_progress(done: int) -> None:

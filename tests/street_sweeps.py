@@ -58,7 +58,7 @@ def warmed_up_once() -> Iterator[None]:
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hodge_pipeline.start.sweeps.first_velocity", once(following.first_velocity))
-        patch.setattr(JUDGE, lambda _, __, told, ___: told)
+        patch.setattr(JUDGE, lambda _, __, told, *___: told)
         yield
 
 

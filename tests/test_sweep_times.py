@@ -176,7 +176,7 @@ def test_sweeps_that_leave_the_motion_loose_judge_no_times(monkeypatch: pytest.M
 def test_times_that_run_backwards_or_are_of_deskewed_points_are_told_by_the_points_on_the_map(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    placed = list[float]()
+    placed, shown = list[float](), list[int]()
     place = scan_to_map.ScanToMap.place
 
     def counted(tracker: scan_to_map.ScanToMap, cloud: PointCloud, time_s: float) -> scan_to_map.Step:
@@ -190,7 +190,9 @@ def test_times_that_run_backwards_or_are_of_deskewed_points_are_told_by_the_poin
     for clouds, sense in ((right, FORWARDS), ([turned(cloud) for cloud in right], BACKWARDS), (flat, UNUSED)):
         given = [(row, row * REVOLUTION_S, cloud) for row, cloud in enumerate(clouds)]
         placed.clear()
-        assert following.sense_of_times(0.5, velocity, FORWARDS, given) == sense
+        shown.clear()
+        assert following.sense_of_times(0.5, velocity, FORWARDS, given, shown.append) == sense
+        assert not sum(shown) and shown.count(1) > 2  # the bar moves, and ends where it was
         assert (len(placed) < 2 * len(given)) == (clouds is right)  # no more are asked once they are surely worse
         if clouds is right:  # as of times by the order of points
             assert following.sense_of_times(0.5, velocity, UNUSED, given) == sense
@@ -223,7 +225,7 @@ def test_points_without_times_are_deskewed_by_their_order_where_the_map_is_sure_
     frames = [changed(frame, untimed) for frame in street()]
     judged = list[tuple[int, int]]()
 
-    def sure(_: float, __: Floats, told: int, sweeps: Sweeping) -> int:
+    def sure(_: float, __: Floats, told: int, sweeps: Sweeping, *___: object) -> int:
         judged.append((told, len(sweeps)))
         return FORWARDS
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
 from hodge_pipeline.registration.scan_to_map import FEWEST_USUAL, START_LEVELS, START_SAMPLE_M, ScanToMap, Step
 from hodge_pipeline.registration.sweeps import BACKWARDS, FORWARDS, UNUSED, retimed
+from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types import Floats, PointCloud
 
 MOST_PASSES = 4
@@ -93,12 +95,20 @@ def _strange_at_end(
     return frozenset()
 
 
-def sense_of_times(voxel_m: float, velocity: Floats, told: int, sweeps: Sequence[tuple[int, float, PointCloud]]) -> int:
+def sense_of_times(
+    voxel_m: float,
+    velocity: Floats,
+    told: int,
+    sweeps: Sequence[tuple[int, float, PointCloud]],
+    advance: Advance = no_progress,
+) -> int:
     """The sense of the times of points in these sweeps, which began with this velocity: `told`, unless surely more
     points lie on the map by another: right times put points where they were, wrong ones blur it.
 
     Sweeps tell where the alignment holds both ways. Along what it leaves loose, as a narrow field does in a corridor,
     paths slide, and points lie on the map by chance: followed so, right times were called backwards.
+
+    `advance` goes back by what is followed again, and in the end is where it was.
     """
     if len(sweeps) < FEWEST_TIMED:
         return told
@@ -107,14 +117,20 @@ def sense_of_times(voxel_m: float, velocity: Floats, told: int, sweeps: Sequence
         return _shares(voxel_m, velocity, ((row, at, retimed(cloud, 0.0, sense)) for row, at, cloud in sweeps))
 
     nearest = UNUSED if told == FORWARDS else FORWARDS
-    shares: dict[int, list[float]] = {told: [], nearest: []}
-    for of_told, of_nearest in zip(on_map(told), on_map(nearest), strict=True):
+    shares = defaultdict[int, list[float]](list, {told: [], nearest: []})
+    advance(NO_MAP - len(sweeps))
+    for count, (of_told, of_nearest) in enumerate(zip(on_map(told), on_map(nearest), strict=True), 1):
+        advance(1)
         shares[told].append(of_told)
         shares[nearest].append(of_nearest)
         if _gain(shares[nearest], shares[told])[1] < -WORSE:
+            advance(len(sweeps) - NO_MAP - count)
             return told
     if _gain(shares[nearest], shares[told])[0] > 0:  # else what skews points the other way fits less still
-        shares[BACKWARDS] = list(on_map(BACKWARDS))
+        advance(NO_MAP - len(sweeps))
+        for share in on_map(BACKWARDS):
+            advance(1)
+            shares[BACKWARDS].append(share)
     gains = {sense: _gain(of_sense, shares[told], FEWEST_TIMED - NO_MAP) for sense, of_sense in shares.items()}
     best = max(gains, key=lambda sense: gains[sense][0])
     return best if gains[best][1] > SURE else told

@@ -44,7 +44,7 @@ from hodge_pipeline.scene import (
     stamps_of,
     vertex_ids,
 )
-from hodge_pipeline.stages import Advance, Step, Steps, Workers
+from hodge_pipeline.stages import Advance, Step, Steps, Workers, no_progress
 from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
@@ -228,12 +228,13 @@ def _follow_one(
     read = np.flatnonzero(part.found)
     turning = begun_s(stamps_s, look.turn_s)
     velocity = part.velocity[read] * (times[-1] / turning[-1] if turning[-1] else 1.0)
-    told = _times_along([frames[row] for row in read], velocity, turning[read], clouds, voxel, look)
+    told = _times_along([frames[row] for row in read], velocity, turning[read], clouds, voxel, look, advance)
     if told == AS_TOLD:
         return part
     times = turning if told[1] != UNUSED else begun_s(stamps_s, 0.0)
     again = [retimed_frame(frame, *told) for frame in frames]
-    part = _follow_as_told(again, times, clouds, voxel, look.reach_m, lambda _: None)
+    advance(-len(frames))
+    part = _follow_as_told(again, times, clouds, voxel, look.reach_m, advance)
     return part._replace(revolution_s=told[0], sense=told[1])
 
 
@@ -332,7 +333,13 @@ def deskewed_along(source: Source, world_from_scan: Floats, clouds: CloudOptions
 
 
 def _times_along(
-    frames: list[Frame], velocity: Floats, times: Floats, clouds: CloudOptions, voxel_m: float, look: Look
+    frames: list[Frame],
+    velocity: Floats,
+    times: Floats,
+    clouds: CloudOptions,
+    voxel_m: float,
+    look: Look,
+    advance: Advance = no_progress,
 ) -> tuple[float, int]:
     """How the times of points are read (`retimed_frame`), by those `WARM_UP` sweeps in a row that skew moves farthest.
 
@@ -347,7 +354,7 @@ def _times_along(
     part = [retimed_frame(frame, look.revolution_s) for frame in frames[first : first + WARM_UP]]
     sweeps = timed_sweeps(part, times[first:], clouds, look.reach_m)
     told = UNUSED if look.revolution_s else FORWARDS
-    sense = sense_of_times(voxel_m, velocity[first], told, sweeps)
+    sense = sense_of_times(voxel_m, velocity[first], told, sweeps, advance)
     return AS_TOLD if sense == told else (look.revolution_s, sense)
 
 
