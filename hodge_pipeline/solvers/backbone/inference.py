@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.special import expit
 
 from hodge_pipeline.complex.series import series_classes
@@ -15,8 +14,8 @@ from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, from_rotations, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, judge
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
-from hodge_pipeline.solvers.backbone.loop_places import loops_at_place, one_of_each_place
-from hodge_pipeline.solvers.backbone.places import MOST_STEPS, MOST_TRIED, Places
+from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
+from hodge_pipeline.solvers.backbone.places import MOST_STEPS, Places
 from hodge_pipeline.solvers.backbone.polish import polished
 from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales
 from hodge_pipeline.types import Bools, Floats
@@ -95,16 +94,13 @@ MOST_LEARNED = 3
 
 @dataclass(frozen=True)
 class _Rated:
-    """All loops at some poses: their log-likelihood, each place counting once; the `score (M,)` of each, the lesser of
-    its log-odds and its log Bayes factor; the shares (2,) of right and wrong ones; the chain there; and whether some of
-    the used loops alone led there: another choice of them changes the likelihood by more than one place does.
+    """All loops at some poses: the `score (M,)` of each, the lesser of its log-odds and its log Bayes factor; the
+    shares (2,) of right and wrong ones; and the chain there.
     """
 
-    likelihood: float
     score: Floats
     shares: Floats
     linear: Linear
-    is_thinned: bool
 
 
 @dataclass(frozen=True)
@@ -169,8 +165,7 @@ class _Trial:
         """All loops judged at the poses of the used ones (M,), of which those that remain likely are used."""
         start, chain, trusted = self.start, self.start.chain, self.trusted
         reduced = thinned(chain, np.flatnonzero(used))
-        # wrong loops may have led into a local minimum that the right ones do not leave
-        fit = min((optimised(Fit(reduced, begun), MOST_STEPS) for begun in (linear, start)), key=lambda each: each.cost)
+        fit = optimised(Fit(reduced, linear), MOST_STEPS)
         judged = judge(fit.linear, fit, shares, self.outliers)
         shares, top = mixture(judged.factor)
         used = used & ((judged.log_odds > 0) | trusted)
@@ -179,52 +174,24 @@ class _Trial:
         linear, reduced = fit.linear if used.any() else start, thinned(chain, np.flatnonzero(used))
         return Inferred(used, judged, self.scales, start, linear, reduced, top, confirmed)
 
-    @cached_property
-    def place_share(self) -> Floats:
-        """The weight (M,) of each loop, so that all of one place count once."""
-        return 1 / loops_at_place(self.start.chain.places)
-
     def grown(self) -> tuple[Bools, _Rated] | None:
         """Loops (M,) to begin with, and all loops at their poses: the strongest alone, then in rounds those that stand
-        out at the new poses. Where none does, and not so many are used that some must do for all, one place is added,
-        that of a few with which all loops are likeliest, while their likelihood rises.
+        out at the new poses.
 
         Weak loops may be wrong in one way together and, taken all at once, bend the poses until right ones do not fit.
         """
         trusted = self.trusted
         limit = 0.5 * np.log(max(len(trusted), 1))
         used = (self.alone.factor > 2 * limit) | trusted
-        found = self.rated(used, self.start, self.shares)
+        rated = self.rated(used, self.start, self.shares)
         for number in range(MOST_GROWN):
-            if found is None:
+            if rated is None:
                 return None
-            rated = found
             before, used = used, (rated.score > limit) | (used & (rated.score > 0)) | trusted
-            if not number or used.sum() > before.sum():
-                found = self.rated(used, rated.linear, rated.shares)
-                continue
-            if rated.is_thinned:
+            if number and used.sum() <= before.sum():
                 break
-            each = [(more, self.rated(more, rated.linear, rated.shares)) for more in self.with_one_place(used, rated)]
-            best = used, rated
-            for more, other in each:
-                if other is not None and other.likelihood > best[1].likelihood:
-                    best = more, other
-            if best[1] is rated:
-                break
-            used, found = best
-        return used, rated
-
-    def with_one_place(self, used: Bools, rated: _Rated) -> list[Bools]:
-        """The used loops (M,) and those of one more place, for each of the strongest places that have no used loop."""
-        ends, out = self.start.chain.places, list[Bools]()
-        score = np.where(used, 0.0, rated.score)
-        score[cKDTree(ends[used]).query(ends, p=np.inf)[0] <= 1.0] = 0.0
-        while len(out) < MOST_TRIED and score.max(initial=0.0) > 0:
-            place = np.abs(ends - ends[np.argmax(score)]).max(axis=1) < 1.0
-            out.append(used | (place & (score > 0)))
-            score[place] = 0.0
-        return out
+            rated = self.rated(used, rated.linear, rated.shares)
+        return None if rated is None else (used, rated)
 
     def rated(self, used: Bools, linear: Linear, shares: Floats) -> _Rated | None:
         """All loops at the poses of one used loop (M,) of each place, optimised from `linear`; None as in `infer`."""
@@ -236,9 +203,7 @@ class _Trial:
         fit = optimised(Fit(reduced, linear), MOST_STEPS)
         judged = judge(fit.linear, fit, shares, self.outliers)
         shares, _ = mixture(judged.factor)
-        each = np.logaddexp(np.log(shares[0]) + judged.factor, np.log(shares[1]))
-        likelihood, score = float(self.place_share @ each), np.minimum(judged.factor, judged.log_odds)
-        return _Rated(likelihood, score, shares, fit.linear, is_thinned=len(reduced.active) < len(rows))
+        return _Rated(np.minimum(judged.factor, judged.log_odds), shares, fit.linear)
 
     def agreed(self, used: Bools, shares: Floats, linear: Linear) -> tuple[Bools, Judged, Linear] | None:
         """Loops (M,) that agree with the poses that they lead to, iterated from those `used (M,)` on; how all are
