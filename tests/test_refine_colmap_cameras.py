@@ -10,7 +10,7 @@ import pycolmap
 import pytest
 
 import hodge_pipeline
-from colmap_data import FREE, noisy, synthetic
+from colmap_data import FREE, disturbed, noisy, synthetic
 from hodge_adapters.colmap.cameras import colmap_camera
 from hodge_adapters.colmap.content import read_model
 from hodge_adapters.colmap.models import ColmapModels
@@ -107,6 +107,14 @@ def test_a_principal_point_that_tracks_contradict_is_a_doubt(tmp_path: Path) -> 
         camera.params = camera.params + np.array([0.0, 40.0, -30.0, 0.0])
     (result,) = hodge_pipeline.refine_colmap(model, database="none", overrides=FREE).results
     assert "principal points moved by" in result.decision.doubt and result.decision.doubt.endswith("--refine all")
+
+
+def test_calibrations_of_an_exact_model_are_not_in_doubt(tmp_path: Path) -> None:
+    """Freed, they gained half of 8e-8 px."""
+    synthetic(tmp_path)
+    off = disturbed(tmp_path / "text", tmp_path / "off")
+    (result,) = hodge_pipeline.refine_colmap(off, database="none", overrides=FREE).results
+    assert result.decision.outcome == "refined" and result.decision.doubt == ""
 
 
 @pytest.mark.parametrize("refine", ["none", "focal", "all"])

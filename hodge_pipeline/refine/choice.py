@@ -12,14 +12,12 @@ from hodge_pipeline.evaluation.scores import SIGMA_M
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.refine.candidates import CandidateSet
 from hodge_pipeline.refine.guard import SCORE_TOLERANCE, Measure
-from hodge_pipeline.refine.reprojection_cost import ENOUGH_SEEN, best, degrees_of_freedom, mends
+from hodge_pipeline.refine.reprojection_cost import ENOUGH_SEEN, FINEST_PX, best, degrees_of_freedom, mends
 from hodge_pipeline.refine.uncertainty import told_apart
 from hodge_pipeline.stages import Step, Steps
 from hodge_pipeline.types import Floats
 from hodge_pipeline.types.tracked_model import Adjusted, TrackedModel
 
-FINEST_PX = 0.01
-"""Mean reprojection error below which the input is kept: no detector locates keypoints better."""
 LEAST_GAIN = 0.01
 """Share of the cost per degree of freedom that must be saved: a lens model that fits badly causes gains below it."""
 CLEAR_GAIN = 0.5

@@ -7,7 +7,7 @@ from typing import Literal
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.difference import alike
 from hodge_pipeline.refine.candidates import CandidateSet, adjusted_model
-from hodge_pipeline.refine.reprojection_cost import ENOUGH_SEEN, costs, degrees_of_freedom
+from hodge_pipeline.refine.reprojection_cost import ENOUGH_SEEN, FINEST_PX, costs, degrees_of_freedom
 from hodge_pipeline.stages import Steps
 from hodge_pipeline.types.tracked_model import TrackedModel
 
@@ -28,14 +28,14 @@ LEAST_FREEDOM = 10
 def intrinsics_doubt(found: CandidateSet, steps: Steps) -> str:
     """Why a model is in doubt: its best candidate that moves poses fits much better with free rigs or intrinsics.
 
-    "" where it does not, where too few observations tell, where these are refined anyway, and where the input's
-    poses fit better than any that were moved.
+    "" where it does not, where too few observations tell, where these are refined anyway, where that candidate is
+    exact, and where the input's poses fit better than any that were moved.
     """
     at = min((row for row, one in enumerate(found.candidates) if not one.holds_poses), default=0, key=found.px)
     model = found.candidates[at].model
     if not at or model.moves_calibration or degrees_of_freedom(model) < LEAST_FREEDOM * model.quality.images:
         return ""
-    if (1 - FREE["focal"][-1]) * found.px(at) > found.px(found.best):
+    if found.px(at) < FINEST_PX or (1 - FREE["focal"][-1]) * found.px(at) > found.px(found.best):
         return ""
     part = model.thinned(ENOUGH_SEEN)
     if part is not model:

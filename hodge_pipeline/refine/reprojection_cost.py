@@ -12,6 +12,8 @@ from hodge_pipeline.types import Bools, Floats, Ints, ModelQuality
 from hodge_pipeline.types.text import counted
 from hodge_pipeline.types.tracked_model import TrackedModel
 
+FINEST_PX = 0.01
+"""Mean error below which a model is exact: no detector locates keypoints better."""
 CONTRADICTING_PX = 4.0
 """Mean error at which observations contradict each other: COLMAP filters each that is farther off."""
 LEAST_CAP_PX = 4.0
