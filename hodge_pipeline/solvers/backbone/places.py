@@ -31,7 +31,7 @@ MISTAKEN_PLACES = 0.2
 once would stay open: its loops can show little more than that the drift is as stated.
 """
 MOST_TRIED = 3
-"""Places left out or added on trial each time, and groups of loops that may be added: limits on cost."""
+"""Places left out on trial each time: a limit on cost."""
 CLEARLY = float(np.log(20.0))
 """Log-odds that a change must gain."""
 FEW_UNUSED = 0.1
@@ -70,9 +70,8 @@ class Places:
     """Places that the loops of a chain join; adjacent ones are one, up to the length of a corridor.
 
     - `start`: the bare chain. `loop (K,)`: one loop of each place, ascending; `bare (K,)`: its log Bayes factor on the
-      bare chain; `size (K,)`: how many loops agree there; `used (K,)`: places of used loops, the others of unused ones.
-    - `members (M,)`: the place of each used loop and of each loop of an unused place; −1 elsewhere.
-    - `unused (G,)`: sizes of the other groups of unused loops.
+      bare chain; `size (K,)`: how many loops agree there.
+    - `members (M,)`: the place of each used loop; −1 elsewhere. `unused (G,)`: sizes of the groups of unused loops.
     """
 
     start: Linear
@@ -80,13 +79,12 @@ class Places:
     loop: Ints
     bare: Floats
     size: Floats
-    used: Bools
     members: Ints
     unused: Ints
 
     @classmethod
     def of(cls, start: Linear, alone: Judged, used: Bools, outliers: OutlierModel) -> Places:
-        """Places of the used loops (M,), and of the largest agreeing groups of unused ones, of at least median size."""
+        """Places of the used loops (M,)."""
         ends, rows = start.chain.places, np.flatnonzero(used)
         place = rows[one_of_each_place(ends[rows])]
         distance, nearest = cKDTree(ends[place]).query(ends, p=np.inf)
@@ -97,31 +95,21 @@ class Places:
         by_size = np.lexsort((-loops, run))
         first = by_size[np.unique(run[by_size], return_index=True)[1]]
         groups = agreeing_groups(PairwiseConsistency.of(start, alone.log_wrong), np.flatnonzero(distance > 1.0))
-        usual = np.median(loops[first])
-        may_be_added = np.array([len(group) >= usual and alone.factor[group[0]] > 0 for group in groups], bool)
-        may_be_added[MOST_TRIED:] = False
-        added = [groups[each] for each in np.flatnonzero(may_be_added)]
-        members = np.where(used, run[nearest], -1)
-        for number, group in enumerate(added, start=len(first)):
-            members[group] = number
-        loop = np.concatenate([place[first], *[group[:1] for group in added]]).astype(np.int64)
-        size = np.concatenate([loops[first], [len(group) for group in added]])
-        order = np.argsort(loop)
+        order = np.argsort(place[first])
+        loop = place[first][order]
         return cls(
             start,
             outliers,
-            loop=loop[order],
-            bare=alone.factor[loop[order]],
-            size=size[order],
-            used=order < len(first),
-            members=np.append(np.argsort(order), -1)[members],
-            unused=np.array([len(group) for group in groups], np.int64)[~may_be_added],
+            loop=loop,
+            bare=alone.factor[loop],
+            size=loops[first][order],
+            members=np.where(used, np.argsort(order)[run[nearest]], -1),
+            unused=np.array([len(group) for group in groups], np.int64),
         )
 
     def rivals(self, right: Bools) -> Floats:
         """The logarithm (K,) of the expected number of mistaken places with as many loops as each has."""
-        others = np.where(self.used, self.size / ALIKE, self.size)[~right]
-        sizes = np.sort(np.concatenate([self.unused, others]))
+        sizes = np.sort(np.concatenate([self.unused, self.size[~right] / ALIKE]))
         return np.asarray(np.log(len(sizes) - np.searchsorted(sizes, self.size) + MISTAKEN_PLACES))
 
     def chance(self, right: Bools) -> float:
@@ -163,10 +151,10 @@ class Places:
         return self.outliers.at(self.start.chain, rows, fit.loops[0]).log_density(by_path(self.start, rows))
 
     def best(self, linear: Linear) -> Arrangement:
-        """The likeliest arrangement, from all used places, whose poses are near `linear`, by leaving out or adding
-        single places while the log-odds rise.
+        """The likeliest arrangement, from all places, whose poses are near `linear`, by leaving out single ones while
+        the log-odds rise.
         """
-        found = self.arranged(self.used, linear)
+        found = self.arranged(np.ones(len(self.loop), bool), linear)
         changes = self._changes(found)
         while changes:
             tried = self.arranged(changes.pop(0), found.fit.linear)
@@ -175,21 +163,18 @@ class Places:
         return found
 
     def _changes(self, found: Arrangement) -> list[Bools]:
-        """Arrangements (K,) that differ in one place and may be likelier: without one that the others contradict, the
-        largest χ² first; or with one more. None where not all places are active, since others would be then.
+        """Arrangements (K,) that may be likelier: without one place that the others contradict, the largest χ² first.
+        None where not all places are active, since others would be then.
         """
-        each, out = np.arange(len(self.loop)), list[Bools]()
-        if len(found.fit.reduced.active) < found.right.sum():
-            return out
-        if found.right.sum() > 1:
-            active = np.searchsorted(self.loop, found.fit.reduced.active)
-            residual, covariance = found.fit.left_out(found.fit.reduced.of_loops)
-            log_density, chi2 = student_log_density(residual, covariance)
-            log_odds = log_density - self._log_wrong(found.fit) - self.rivals(found.right)[active]
-            bent = np.argsort(-chi2, kind="stable")
-            doubtful = active[bent[(log_odds + np.log(MISTAKEN_PLACES))[bent] < 0][:MOST_TRIED]]
-            out = [found.right & (each != place) for place in doubtful]
-        return out + [found.right | (each == place) for place in np.flatnonzero(~self.used & ~found.right)]
+        if found.right.sum() < 2 or len(found.fit.reduced.active) < found.right.sum():
+            return []
+        active = np.searchsorted(self.loop, found.fit.reduced.active)
+        residual, covariance = found.fit.left_out(found.fit.reduced.of_loops)
+        log_density, chi2 = student_log_density(residual, covariance)
+        log_odds = log_density - self._log_wrong(found.fit) - self.rivals(found.right)[active]
+        bent = np.argsort(-chi2, kind="stable")
+        doubtful = active[bent[(log_odds + np.log(MISTAKEN_PLACES))[bent] < 0][:MOST_TRIED]]
+        return [found.right & (np.arange(len(self.loop)) != place) for place in doubtful]
 
 
 def agreeing_groups(pairwise: PairwiseConsistency, rows: Ints) -> list[Ints]:
