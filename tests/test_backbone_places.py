@@ -98,7 +98,7 @@ def test_many_right_places_are_not_outnumbered_by_wrong_loops(monkeypatch: pytes
     assert find_backbone(drive(count=3000, world="town", loops=150, wrong=0.3).graph) is not None
     places, linear = met[0]
     places = replace(places, size=np.ones(len(places.size)), unused=np.ones(18_000, np.int64))
-    count = int(places.used.sum())
+    count = len(places.loop)
     # so much that each is less likely than one of the 18,000, but not all of them together
     monkeypatch.setattr(Places, "_density", lambda places, fit: 10.0 * len(fit.reduced.active))
     found = best(places, linear)
