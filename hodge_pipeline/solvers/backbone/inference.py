@@ -143,7 +143,6 @@ class _Trial:
         shares, linear = rated.shares, rated.linear
         start, chain, trusted = self.start, self.start.chain, self.trusted
         fold = int(chain.broken.sum()) * float(np.log(chain.size))  # for the choice of the broken steps among all
-        enough = MISTAKEN + (self.scales.prior_cost() if chain.stated else 0.0) + fold
         for _ in range(REARRANGED):
             found = self.agreed(used | trusted, shares, linear)
             if found is None:
@@ -154,7 +153,7 @@ class _Trial:
                 break
             places = Places.of(start, self.alone, agreed, self.outliers)
             best = places.best(linear)
-            confirmed = best.of_all > enough and places.chance(best.right) + fold < -BY_CHANCE
+            confirmed = best.of_all > MISTAKEN + fold and places.chance(best.right) + fold < -BY_CHANCE
             used = np.append(best.right, False)[places.members]
             if (used == before).all() or not confirmed:
                 break
@@ -273,9 +272,7 @@ def _limit(judged: Judged) -> float:
 
 
 MISTAKEN = float(np.log(20.0))
-"""Log-odds of right places against mistaken ones that are enough where steps err as stated; with larger learned errors
-`Scales.prior_cost` is added, since mistaken places may have caused these.
-"""
+"""Log-odds of right places against mistaken ones that are enough."""
 
 
 def by_chance(count: int) -> float:

@@ -68,10 +68,6 @@ class Scales:
             covariance=chain.covariance * np.outer(loop, loop),
         )
 
-    def prior_cost(self) -> float:
-        """Minus the log-prior of the scales of steps above 1, in nats."""
-        return float(0.5 * (np.log(np.maximum([self.step_turn, self.step_shift], 1.0)) ** 2).sum() / FOLD**2)
-
     @property
     def at_most_stated(self) -> Scales:
         """Those of these scales that are below 1, the others 1."""
