@@ -137,6 +137,7 @@ def _trajectories(
     if not has_truth(scene.whole):
         return ()
     if scene.given is not None:
+        sets = {**sets, "result": final[scene.key_frames.rows]}
         return _of_file(scene.given, scene.key_frames, sets, recipe.evaluation.rpe_delta_frames, kept=kept)
     every = {name: scene.key_frames.expand(poses) for name, poses in sets.items()} | {"result": final}
     if has_given(scene.source):
