@@ -15,8 +15,9 @@ from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances
 from hodge_pipeline.pairs.held_out import held_out_pairs
-from hodge_pipeline.refine.against_images import against_images
+from hodge_pipeline.refine.against_images import against_images, first_of_steps
 from hodge_pipeline.refine.conventions import explained
+from hodge_pipeline.refine.given_noise import without_noise
 from hodge_pipeline.refine.guard import SCORE_TOLERANCE, Decision, Measure, decide, mean_noise
 from hodge_pipeline.refine.path_size import path_size
 from hodge_pipeline.refine.uncertainty import mean_chi2, pose_change
@@ -34,6 +35,7 @@ CHI2_TOLERANCE = 0.02
 KNOTS_APART = (16, 8, 4, 2, 1)
 """Key frames between two knots of the correction: the steps between keep their given shape, which may be better than
 registered ones. The widest spacing that fits the held-out pairs as well as the best is kept."""
+KEPT = "already optimal: edges may err by as much as they correct these poses"
 LEAST_JOINED = 0.2
 """Share of the key frames that must overlap with another one, else the given poses are not of these frames."""
 
@@ -73,13 +75,17 @@ def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
     nothing = _nothing(last)
     if nothing or last.solution is None:
         return Decision("nothing", nothing), before
-    chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, last.world_from_cam)]
-    after, measures = _held_out(work, rounds, key_frames)
+    smoothed = without_noise(last.graph, last.solution, before, first_of_steps(key_frames))
+    solved = last.world_from_cam if smoothed is None or smoothed is before else smoothed
+    chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, solved)]
+    after, measures = _held_out(work, held_out_pairs(rounds), key_frames, solved)
     measures.append(chi2_measure(*chi2))
     moved = pose_change(last.graph, replace(last.solution, world_from_cam=after), before)
     decision = decide(measures, moved, force=work.recipe.guard.force)
     if convention:
         return Decision("forced", convention, decision.measures, moved), after
+    if decision.outcome == "refined" and smoothed is before:
+        return Decision("optimal", KEPT, decision.measures, moved), after
     if decision.outcome == "refined":  # so far by clouds alone, which a sensor may warp alike in every frame
         measures += [
             *against_images(work, key_frames, after),
@@ -146,12 +152,11 @@ def chi2_measure(before: float, after: float) -> Measure:
     return Measure("edge chi2, mean", before, after, tolerance=CHI2_TOLERANCE * before)
 
 
-def _held_out(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tuple[Floats, list[Measure]]:
+def _held_out(work: Work, pairs: Ints, key_frames: KeyFrames, after: Floats) -> tuple[Floats, list[Measure]]:
     """The widest spaced correction (K, 4, 4) that fits the pairs held out of every round, and their score as a measure.
 
-    Without such pairs the last round's poses, and no measure.
+    Without such pairs the poses after, and no measure.
     """
-    pairs, after = held_out_pairs(rounds), rounds[-1].world_from_cam
     if not len(pairs):
         work.steps.note(Note("nothing held out", 0))
         return after, []

@@ -28,6 +28,15 @@ def mean_chi2(graph: ViewGraph, weights: Floats, world_from_cam: Floats) -> floa
     return float(weights @ chi2_by_information(graph, world_from_cam)) / total if total > 0 else float("nan")
 
 
+def reduced_chi2(graph: ViewGraph, solution: Solution) -> float:
+    """The weighted χ² of the edges used, by their degrees of freedom beyond those of the poses; NaN of a tree."""
+    used = int(solution.kept.sum())
+    freedom = 6 * (used - graph.vertex_count + 1 + int(solution.component.max(initial=0)))
+    if freedom <= 0:
+        return float("nan")
+    return float(solution.weights @ chi2_by_information(graph, solution.world_from_cam)) / freedom
+
+
 def pose_change(graph: ViewGraph, solution: Solution, before: Floats) -> PoseChange:
     """The change from the poses before (V, 4, 4) to the solution, with the uncertainty that the edges leave.
 
@@ -128,15 +137,13 @@ def _moved_and_known(start: TrackedModel, model: TrackedModel) -> tuple[Floats, 
 
 def _sigmas(graph: ViewGraph, solution: Solution, used: Ints, rows: Ints) -> tuple[float, float]:
     """RMS over the vertices `rows` of the standard deviations of rotation (radians) and translation (metres)."""
-    chosen = graph.select(used)
-    weights = solution.weights[used]
-    chosen = replace(chosen, information=chosen.information * weights[:, None, None])
-    freedom = 6 * (len(used) - graph.vertex_count + 1 + int(solution.component.max(initial=0)))
-    if freedom <= 0:
+    reduced = reduced_chi2(graph, solution)
+    if np.isnan(reduced):
         return float("nan"), float("nan")
-    inflation = max(1.0, float(chi2_by_information(chosen, solution.world_from_cam).sum()) / freedom)
+    chosen, weights = graph.select(used), solution.weights[used]
+    chosen = replace(chosen, information=chosen.information * weights[:, None, None])
     try:
-        covariances = marginal_covariances(chosen, solution.world_from_cam, rows) * inflation
+        covariances = marginal_covariances(chosen, solution.world_from_cam, rows) * max(1.0, reduced)
     except (GraphError, np.linalg.LinAlgError, RuntimeError):  # a singular graph has no covariance
         return float("nan"), float("nan")
     spread = np.einsum("kii->ki", covariances)

@@ -1,0 +1,115 @@
+"""Whether edges know the shape of given poses better than these do, and given poses less their own white noise.
+
+Edges measure from frame to frame, so their errors add up to a slow bend that no pair of overlapping frames shows; given
+poses may be rough and yet not bend at all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import chdtri
+
+from hodge_pipeline import se3
+from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.errors import GraphError
+from hodge_pipeline.refine.uncertainty import reduced_chi2
+from hodge_pipeline.solvers.covariance import relative_covariances
+from hodge_pipeline.solvers.maximum_likelihood import solve
+from hodge_pipeline.types import Floats, Ints, Priors, Solution, ViewGraph
+from hodge_pipeline.types.arrays import evenly
+
+STATED_SHARE, SHARED = 0.2, 100.0
+"""Least share of the stated variances that counts, and least times what the edges leave over. Errors that all edges of
+a frame share, as of shutter, sampling and the delay between depth and colour, close every cycle: poses of rendered
+rooms and drives are off by 2 to 100 times what the edges leave over, those of landmarks by 0.05 to 0.2 times the stated
+variances. The largest count; where no cycle tests the edges, all that they state.
+"""
+FARTHER, CHANCE = 3.0, 0.01
+"""Times the variance of edges and noise by which given poses are farther off than these, and the chance that any pair
+of such poses is farther off still. True poses are off by up to 0.5 times in rendered rooms and drives, by 2.1 times in
+a real recording (red kitchen); poses that bend or jump visibly by 4 times and more.
+"""
+PLACES = 16
+"""Pairs of each distance, evenly along the path."""
+LEAST = 1e-6
+"""Share of the larger variance, of rotations or translations, below which poses are as good as held."""
+
+
+def without_noise(graph: ViewGraph, solution: Solution, given: Floats, firsts: Ints) -> Floats | None:
+    """The given poses (K, 4, 4) less their white noise, where it exceeds that of the edges, which led to the solution;
+    `firsts (S,)`: the rows that are followed by another one of their sequence.
+
+    None where edges decide alone: some pair, whatever its distance, is farther from where they put it than both err.
+    """
+    edges = _weakened(graph, solution)
+    component = connected_components(edges.edges, edges.vertex_count)
+    octaves = _octaves(component)
+    try:
+        covariances = [relative_covariances(edges, solution.world_from_cam, pairs) for pairs in octaves]
+    except (GraphError, np.linalg.LinAlgError, RuntimeError):  # a singular graph has no covariance
+        return None
+    white = _white(solution, given, firsts[component[firsts] == component[firsts + 1]])
+    if _farther(solution, given, np.concatenate(octaves), np.concatenate(covariances), white):
+        return None
+    if np.isnan(reduced_chi2(graph, solution)) or not (white > _white_at_most(covariances[0])).any():
+        return given
+    information = np.diag(np.repeat(1 / np.maximum(white, LEAST * white.max()), 3))
+    priors = Priors(np.arange(len(given)), given, np.tile(information, (len(given), 1, 1)))
+    return solve(edges, start=given, initial="given", priors=priors).world_from_cam
+
+
+def _weakened(graph: ViewGraph, solution: Solution) -> ViewGraph:
+    """The edges used, with the information that they have with the errors that they share."""
+    used, reduced = np.flatnonzero(solution.weights > 0), reduced_chi2(graph, solution)
+    share = 1.0 if np.isnan(reduced) else max(STATED_SHARE, SHARED * reduced)
+    weights = solution.weights[used] / share
+    return replace(graph.select(used), information=graph.information[used] * weights[:, None, None])
+
+
+def _octaves(component: Ints) -> list[Ints]:
+    """Pairs (P, 2) of rows 1, 2, 4, 8 ... apart, each in one component."""
+    out, apart = [], 1
+    while apart < len(component):
+        starts = evenly(len(component) - apart, PLACES)
+        out.append(np.stack([starts, starts + apart], axis=1)[component[starts] == component[starts + apart]])
+        apart *= 2
+    return out
+
+
+def _corrections(solution: Solution, given: Floats, pairs: Ints) -> Floats:
+    """How the motions of pairs (P, 2) by the solution differ from given ones: ξ (P, 6) in the second pose's axes."""
+    return se3.log(se3.between(given, pairs[:, ::-1]) @ se3.between(solution.world_from_cam, pairs))
+
+
+def _white(solution: Solution, given: Floats, firsts: Ints) -> Floats:
+    """The variances (2,) of rotations and translations that each pose has on its own.
+
+    What white noise adds to a step the next one takes back: two steps are off by no more than one. By a random walk
+    they are off by twice its variance, by a bend more.
+    """
+    twice = firsts[:-1][np.diff(firsts) == 1]
+    if not len(twice):
+        return np.zeros(2)
+    one, two = (
+        (_corrections(solution, given, np.stack([starts, starts + apart], axis=1)) ** 2).mean(axis=0)
+        for starts, apart in ((firsts, 1), (twice, 2))
+    )
+    return np.asarray(np.maximum((one - two / 2).reshape(2, 3).mean(axis=1), 0.0))
+
+
+def _white_at_most(of_steps: Floats) -> Floats:
+    """The variances (2,) of white noise of edges with such covariances (P, 6, 6) of steps, if these have no other."""
+    spread = np.einsum("pii->pi", of_steps).reshape(-1, 2, 3)
+    return spread.mean(axis=(0, 2)) / 2 if len(spread) else np.full(2, np.inf)
+
+
+def _farther(solution: Solution, given: Floats, pairs: Ints, covariances: Floats, white: Floats) -> bool:
+    """Whether any pair (P, 2) is farther off than edges and white noise allow, see `FARTHER`."""
+    noise = np.diag(np.repeat(white, 3))
+    second_from_first = se3.adjoint(se3.between(given, pairs[:, ::-1]))
+    both = covariances + noise + second_from_first @ noise @ np.swapaxes(second_from_first, 1, 2)
+    off = _corrections(solution, given, pairs)
+    chi2 = np.einsum("pi,pi->p", off, np.linalg.solve(both, off[..., None])[..., 0])
+    return bool((chi2 > FARTHER * chdtri(6, CHANCE / max(1, len(pairs)))).any())
