@@ -21,15 +21,15 @@ from hodge_pipeline.types import Floats, Ints, Priors, Solution, ViewGraph
 from hodge_pipeline.types.arrays import evenly
 
 STATED_SHARE, SHARED = 0.2, 100.0
-"""Least share of the stated variances that counts, and least times what the edges leave over. Errors that all edges of
-a frame share, as of shutter, sampling and the delay between depth and colour, close every cycle: poses of rendered
-rooms and drives are off by 2 to 100 times what the edges leave over, those of landmarks by 0.05 to 0.2 times the stated
-variances. The largest count; where no cycle tests the edges, all that they state.
+"""Least share of the stated variances that counts, and least times what the edges leave over; where no cycle tests the
+edges, all that they state. Errors that all edges of a frame share, as of shutter, sampling and the delay between depth
+and colour, close every cycle. In 111 runs in ten rendered rooms and drives, from true and from disturbed poses, 0.8 of
+these variances covered every pair's error in four of five, and 1.7 of them in 95 of a hundred.
 """
-FARTHER, CHANCE = 3.0, 0.01
+FARTHER, CHANCE = 2.5, 0.01
 """Times the variance of edges and noise by which given poses are farther off than these, and the chance that any pair
-of such poses is farther off still. True poses are off by up to 0.5 times in rendered rooms and drives, by 2.1 times in
-a real recording (red kitchen); poses that bend or jump visibly by 4 times and more.
+of such poses is farther off still. Poses that are true, or 3 mm off, reach 0.5 times in rendered rooms and drives, and
+2.4 times in real recordings (red kitchen); bends and jumps that edges mend reach 3 times and more.
 """
 PLACES = 16
 """Pairs of each distance, evenly along the path."""
