@@ -20,14 +20,15 @@ from hodge_pipeline.demo.sweeps import FARTHEST_M, REVOLUTION_S, SpinningScanner
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.registration import scan_to_map
+from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.scan_to_map import ScanToMap
 from hodge_pipeline.registration.sweeps import (
     deskewed,
     deskewed_frame,
 )
 from hodge_pipeline.sources.frame_facts import frame_facts
-from hodge_pipeline.start.sweeps import Sweeps, _jumps, key_rows
-from hodge_pipeline.types import Floats, Frame, PointCloud
+from hodge_pipeline.start.sweeps import Sweeps, _jumps, key_rows, thickened
+from hodge_pipeline.types import Floats, Frame, PointCloud, Source
 from lidar_worlds import scanner_in
 from street_sweeps import (
     COUNT,
@@ -264,6 +265,29 @@ def test_key_frames_begin_and_end_with_sweeps_that_were_found() -> None:
     at_hand[9:] = False
     found = Sweeps(poses, np.zeros((12, 6)), at_hand, np.zeros(12), np.ones(12, np.int64), 40.0)
     assert key_rows(found, (np.arange(9), np.arange(9, 12)), 1.0, 15.0).tolist() == [1, 4, 8]
+
+
+def test_key_frames_have_the_points_of_the_sweeps_beside_them() -> None:
+    quarter = se3.exp(np.array([0, 0, np.pi / 2, 0, 0, 0]))
+    steps_m = np.array([0, 1, 1, 1, 3, 1, 1.0])  # sweep 2 was not found, sweep 4 is far from the one before
+    poses = quarter @ se3.from_parts(np.eye(3), np.cumsum(steps_m)[:, None] * [1, 0, 0])
+    post = np.array([9.0, 5, 1])
+
+    def seen(pose: Floats) -> PointCloud:
+        post_in_scan = se3.transform(se3.inverse(pose), post[None])
+        return PointCloud(np.concatenate([post_in_scan, np.zeros((1, 3)), [[0.5, 0, 0]]]).astype(np.float32))
+
+    source = Source("", Path(), tuple(Frame(n, n, read_points=partial(seen, pose)) for n, pose in enumerate(poses)))
+    found = Sweeps(poses, np.zeros((7, 6)), np.arange(7) != 2, np.zeros(7), np.ones(7, np.int64), 25.0)
+    sequences = np.arange(6), np.arange(6, 7)
+    thick = thickened(source, np.array([0, 3, 5, 6]), found, sequences, CloudOptions(min_range_m=1.0, max_range_m=80.0))
+    assert [frame.frame_id for frame in thick.frames] == [0, 3, 5, 6]
+    for frame, posts in zip(thick.frames, (2, 2, 2, 1), strict=True):
+        assert frame.read_points is not None
+        points = frame.read_points().points_in_cam
+        assert points.dtype == np.float32 and len(points) == posts + 2  # no return, and what is too near, its own alone
+        pose = poses[int(frame.frame_id)]
+        assert se3.transform(pose, points)[[0, *range(3, len(points))]] == pytest.approx(np.tile(post, (posts, 1)))
 
 
 def test_a_scene_that_changes_is_followed() -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from hodge_pipeline import se3
+from hodge_pipeline.registration.clouds import CloudOptions, in_range
 from hodge_pipeline.scene import UNIX_STAMP_S
 from hodge_pipeline.types import Floats, Floats32, Frame, PointCloud
 
@@ -107,6 +108,31 @@ def deskewed_frame(frame: Frame, velocity: Floats) -> Frame:
 def _read_deskewed(read: Callable[[], PointCloud], stamp_s: float, velocity: tuple[float, ...]) -> PointCloud:
     cloud = read()
     return deskewed(cloud, np.array(velocity), -first_after_s(cloud, stamp_s))
+
+
+def joined_frame(frame: Frame, others: Sequence[Frame], frame_from_other: Floats, options: CloudOptions) -> Frame:
+    """The frame with the points of the others (M) that are in range of their own scanner, moved by (M, 4, 4)."""
+    reads = [other.read_points for other in others if other.read_points is not None]
+    if frame.read_points is None or len(reads) < len(others):
+        return frame
+    return replace(frame, read_points=partial(_read_joined, frame.read_points, reads, frame_from_other, options))
+
+
+def _read_joined(
+    read: Callable[[], PointCloud], reads: list[Callable[[], PointCloud]], motions: Floats, options: CloudOptions
+) -> PointCloud:
+    own, others = read(), [in_range(one(), options) for one in reads]
+    moved = [
+        se3.transform(motion, np.asarray(one.points_in_cam, float)) for motion, one in zip(motions, others, strict=True)
+    ]
+    colours = [one.colours for one in (own, *others) if one.colours is not None]
+    return replace(
+        own,
+        points_in_cam=np.concatenate([own.points_in_cam, *moved]).astype(np.float32),
+        normals_in_cam=None,
+        colours=np.concatenate(colours) if len(colours) == 1 + len(others) else None,
+        times_s=None,
+    )
 
 
 def velocities(poses: Floats, times_s: Floats) -> Floats:

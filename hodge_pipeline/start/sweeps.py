@@ -29,6 +29,7 @@ from hodge_pipeline.registration.sweeps import (
     UNUSED,
     deskewed_frame,
     first_after_s,
+    joined_frame,
     off_neighbours_m,
     retimed_frame,
     velocities,
@@ -64,6 +65,9 @@ from hodge_pipeline.types.notes import Note, notes_of
 VOXELS_IN_REACH, KEY_FRAMES_IN_REACH = 100, 40
 """The reach of the scanner over the voxel and over the key-frame distance: 0.8 m, as in KISS-ICP (Vizzo et al., RA-L
 2023), and 2 m at 80 m."""
+BESIDE = 0.1
+"""Share of the reach within which a sweep beside a key frame lends it its points: 5 m on a street, a step at 50 m/s.
+One after a hole is placed less well."""
 SMALLEST_VOXEL_M = 0.08
 """Four times the usual noise of a range, 2 cm: smaller voxels, as in a room, would hold noise in place of surfaces."""
 WARM_UP = 20
@@ -133,7 +137,9 @@ class SweepsStart(OdometryStart):
         keys = key_source(whole, rows)
         steps.remember(keys, steps.key([whole, rows]))
         steps.note(Note("key frames", len(rows), str(len(frames))))
-        made = make_clouds(keys, clouds, steps, workers)
+        thick = thickened(whole, rows, found, sequences, clouds)
+        steps.remember(thick, steps.key([whole, rows]) + "thickened")
+        made = make_clouds(thick, clouds, steps, workers)
         steps_of = tuple(own for part in sequences if len(own := np.flatnonzero(np.isin(rows, part))))
         joined = steps.step(
             register_steps, made, steps_of, found.world_from_scan[rows], self.odometry,
@@ -147,6 +153,25 @@ def key_rows(found: Sweeps, sequences: tuple[Ints, ...], apart_m: float, angle_d
     """Rows of the key frames among the sweeps that were found: the first and the last of each sequence are some."""
     read = [rows[found.found[rows]] for rows in sequences if found.found[rows].any()]
     return choose_key_frames(found.world_from_scan, read, apart_m, angle_deg, 0)
+
+
+def thickened(whole: Source, rows: Ints, found: Sweeps, sequences: tuple[Ints, ...], clouds: CloudOptions) -> Source:
+    """The key frames, each with the points of the sweep before it and of the one after, where these are near.
+
+    Pairs of single sweeps are pulled ring on ring: along a simulated street they are off by up to 0.05 degrees of pitch
+    and 0.3 cm of height on average, of three sweeps each by less than 0.01 degrees and 0.1 cm.
+    """
+    frames = {}
+    for part in sequences:
+        read = part[found.found[part]]
+        for place in np.flatnonzero(np.isin(read, rows)).tolist():
+            row, around = read[place], np.delete(read[max(place - 1, 0) : place + 2], min(place, 1))
+            key_from_sweep = se3.inverse(found.world_from_scan[row]) @ found.world_from_scan[around]
+            near = np.linalg.norm(key_from_sweep[:, :3, 3], axis=1) < BESIDE * found.reach_m
+            frames[row] = joined_frame(
+                whole.frames[row], [whole.frames[other] for other in around[near]], key_from_sweep[near], clouds
+            )
+    return replace(whole, frames=tuple(frames[row] for row in rows))
 
 
 def follow(
