@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from hodge_pipeline.registration.scan_to_map import FEWEST_USUAL, START_LEVELS, START_SAMPLE_M, ScanToMap, Step
+from hodge_pipeline.registration.scan_to_map import FEWEST_USUAL, START_LEVELS, START_SAMPLE_M, UNKNOWN, ScanToMap, Step
 from hodge_pipeline.registration.sweeps import BACKWARDS, FORWARDS, UNUSED, retimed
 from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types import Floats, PointCloud
@@ -51,28 +51,35 @@ def followed(tracker: ScanToMap, sweeps: Iterable[tuple[int, float, PointCloud]]
         yield held[0], None
 
 
-def first_velocity(voxel_m: float, sweeps: Sequence[tuple[int, float, PointCloud]]) -> tuple[Floats, frozenset[int]]:
-    """The twist per second (6,) at the first of these sweeps, each with its row and time: tracked forwards and
-    backwards until it converges. The rows of strange ones among the first, which only the way back can tell, unless all
-    of the first are: these are a scene that changed.
+def first_velocity(
+    voxel_m: float, sweeps: Sequence[tuple[int, float, PointCloud]]
+) -> tuple[Floats, Floats, frozenset[int]]:
+    """The twist per second (6,) at the first of these sweeps, each with its row and time, with the covariance (3, 3) of
+    its translation: tracked forwards and backwards until it converges. The rows of strange ones among the first, which
+    only the way back can tell, unless all of the first are: these are a scene that changed.
 
     A first pass from rest gives too small a velocity, since rings on the ground look the same ahead. It has converged
     where one end of the sweeps has the velocity that it had before: each pass depends on the one that it begins with.
+    What a pass knows of the velocity goes on into the next: with nothing known, one of a narrow field leapt by metres a
+    second from pass to pass.
     """
     ends: list[Floats] = [np.zeros(6)]  # in turn at the first and at the last of the sweeps
+    spreads: list[Floats] = [UNKNOWN]
     early, strange = {row for row, _, _ in sweeps[: FEWEST_USUAL + 1]}, frozenset[int]()
     while len(sweeps) > 1 and len(ends) <= 2 * MOST_PASSES:
-        tracker = ScanToMap(voxel_m, ends[-1], START_LEVELS, START_SAMPLE_M)
+        tracker = ScanToMap(voxel_m, ends[-1], spreads[-1], START_LEVELS, START_SAMPLE_M)
         if len(ends) % 2:
             for _, time_s, cloud in (sweep for sweep in sweeps if sweep[0] not in strange):
                 tracker.follow(cloud, time_s)
         else:
             strange = _strange_at_end(tracker, sweeps[::-1], early)
         ends.append(tracker.velocity)
+        spreads.append(tracker.spread)
         step_m = np.linalg.norm((ends[-1] - ends[max(0, len(ends) - 3)])[3:]) * (sweeps[1][1] - sweeps[0][1])
         if len(ends) > 2 and step_m < voxel_m / 2:
             break
-    return ends[(len(ends) - 1) // 2 * 2], strange
+    at_first = (len(ends) - 1) // 2 * 2
+    return ends[at_first], spreads[at_first], strange
 
 
 def _strange_at_end(

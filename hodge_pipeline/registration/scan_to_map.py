@@ -48,6 +48,8 @@ ON_MAP = 0.5
 """Finest voxels from a Gaussian of the map within which a point lies on it."""
 ACCELERATION_M_S2, FASTEST_M_S = 5.0, 30.0
 """Sigmas of the motion model: of acceleration, as of a car that brakes hard, and of an unknown velocity."""
+UNKNOWN: Floats = FASTEST_M_S**2 * np.eye(3)
+"""Covariance (3, 3) of an unknown velocity, (m/s)²."""
 SHARED_ERRORS = 30.0
 """Factor on the sigma of a pose that independent points would give: points of a ring or wall share their errors. In a
 simulated corridor steps of 16 beams scattered by 0.1 m and claimed 3 mm.
@@ -82,12 +84,17 @@ class ScanToMap:
     """
 
     def __init__(
-        self, voxel_m: float, velocity: Floats, levels: tuple[int, ...] = LEVELS, sample_m: float = SAMPLE_M
+        self,
+        voxel_m: float,
+        velocity: Floats,
+        spread: Floats = UNKNOWN,
+        levels: tuple[int, ...] = LEVELS,
+        sample_m: float = SAMPLE_M,
     ) -> None:
         self._voxel_m, self._coarsest_m = voxel_m, LOOK_M * voxel_m * levels[0]
         self._map = _Map(voxel_m, levels, sample_m)
         self.velocity, self.pose, self.turn_s, self.is_loose = velocity, np.eye(4), 0.0, False
-        self._spread: Floats = FASTEST_M_S**2 * np.eye(3)  # covariance of the velocity, (m/s)^2
+        self.spread = spread  # covariance of the velocity, (m/s)^2
         self._time_s: float | None = None
         self._usual = deque[float](maxlen=USUAL_OF)
 
@@ -102,7 +109,7 @@ class ScanToMap:
     def accept(self, step: Step) -> None:
         """The sweep placed last joins the map, and its motion the filter."""
         self._map.insert(step.pose)
-        self.pose, self.velocity, self._spread, self._time_s = step.pose, step.velocity, step.spread, step.time_s
+        self.pose, self.velocity, self.spread, self._time_s = step.pose, step.velocity, step.spread, step.time_s
         self.turn_s, self.is_loose = step.turn_s, step.is_loose
         if np.isfinite(step.on_map):
             self._usual.append(step.on_map)
@@ -112,7 +119,7 @@ class ScanToMap:
         turn_s = 0.0 if cloud.times_s is None else float(cloud.times_s.max())
         duration = 0.0 if self._time_s is None else time_s - self._time_s
         before, velocity, rates = self.pose, self.velocity, [self.velocity]
-        predicted, spread = before @ se3.exp(velocity * duration), self._spread
+        predicted, spread = before @ se3.exp(velocity * duration), self.spread
         moved_spread = spread = spread + (ACCELERATION_M_S2 * duration) ** 2 * np.eye(3)
         far_m = _far_m(cloud.points_in_cam)
         for _ in range(MOST_DESKEWS):
@@ -178,7 +185,7 @@ class _Map:
     """Voxels of Gaussians (Koide et al., ICRA 2021) of the sweeps so far, at several sizes, coarse to fine."""
 
     def __init__(self, voxel_m: float, levels: tuple[int, ...], sample_m: float) -> None:
-        self._sample_m, self._is_empty, self._sweep, self._spurious = sample_m * voxel_m, True, None, 0.0
+        self._sample_m, self._is_empty, self._sweep, self._spurious = sample_m * voxel_m, True, None, np.zeros((3, 3))
         self._share, self._shares = np.nan, deque[float](maxlen=USUAL_OF)  # of inliers: of the sweep, of those before
         self._error, self._errors = np.nan, deque[float](maxlen=USUAL_OF)  # mean of inliers, likewise
         self._levels = [(size * voxel_m, small_gicp.GaussianVoxelMap(size * voxel_m)) for size in levels]
@@ -257,41 +264,47 @@ class _Map:
         self._is_empty = False
 
     def _thinned(self, points: Floats) -> Any:
-        """One point per voxel with its covariance, without those whose neighbours lie on a line.
-
-        Normals from k neighbours have a variance of λ3 / (λ2 k), and this share of the information along a bare wall is
-        spurious: 0.4 % in a tunnel at 16 beams, where alignment would stop the scanner.
-        """
+        """One point per voxel with its covariance, without those whose neighbours lie on a line."""
         sweep = small_gicp.voxelgrid_sampling(points, self._sample_m)
         sampled = np.asarray(sweep.points())[:, :3]
         if len(sampled) > NEIGHBOURS:
             rows, _ = small_gicp.KdTree(sweep).batch_knn_search(sampled, NEIGHBOURS)
-            least, second, most = _variances(sampled, np.asarray(rows, np.int64))
+            scatter = _scatter(sampled, np.asarray(rows, np.int64))
+            least, second, most = _variances(scatter)
             is_flat = second > FLATTEST * most
             if is_flat.sum() > NEIGHBOURS:
                 sweep = small_gicp.PointCloud(sampled[is_flat])
-                self._spurious = float(np.mean(least[is_flat] / second[is_flat])) / NEIGHBOURS
+                self._spurious = _noise_of_normals(scatter[is_flat], least[is_flat], second[is_flat], most[is_flat])
         small_gicp.estimate_covariances(sweep, None, NEIGHBOURS)
         return sweep
 
 
-def _without_spurious(information: Floats, share: float) -> Floats:
-    """The information (6, 6), less this share of the total on translation in every direction of translation."""
+def _without_spurious(information: Floats, spurious: Floats) -> Floats:
+    """The information (6, 6), less what is spurious of that on translation, (3, 3) of a total of 1, in its axes."""
     values, vectors = np.linalg.eigh(information[3:, 3:])
     total = values.sum()
-    held = np.maximum(values - share * total, LEAST * total) / np.maximum(values, LEAST * total)
+    real = values - total * np.einsum("ji,jk,ki->i", vectors, spurious, vectors)
+    held = np.maximum(real, LEAST * total) / np.maximum(values, LEAST * total)
     scale = np.eye(6)
     scale[3:, 3:] = vectors * np.sqrt(held) @ vectors.T
     return np.asarray(scale @ information @ scale)
 
 
-def _variances(points: Floats, rows: Ints) -> tuple[Floats, Floats, Floats]:
-    """The variances (N,) of groups of points (P, 3) by rows (N, K) along their axes, least first, times K: eigenvalues
-    in closed form (Smith, CACM 1961), in a tenth of LAPACK's time on as many small matrices.
-    """
+def _scatter(points: Floats, rows: Ints) -> Floats:
+    """The covariances (N, 3, 3) of groups of points (P, 3) by rows (N, K), times K."""
     around = [column[rows.T] for column in np.ascontiguousarray(points.T)]
-    x, y, z = (column - column.mean(axis=0) for column in around)
-    xx, yy, zz, xy, xz, yz = (np.einsum("kn,kn->n", a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z)))
+    centred = [column - column.mean(axis=0) for column in around]
+    scatter = np.empty((len(rows), 3, 3))
+    for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
+        scatter[:, i, j] = scatter[:, j, i] = np.einsum("kn,kn->n", centred[i], centred[j])
+    return scatter
+
+
+def _variances(scatter: Floats) -> tuple[Floats, Floats, Floats]:
+    """The eigenvalues (N,) of symmetric matrices (N, 3, 3), least first: in closed form (Smith, CACM 1961), in a tenth
+    of LAPACK's time on as many small matrices.
+    """
+    xx, yy, zz, xy, xz, yz = (scatter[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
     mean = (xx + yy + zz) / 3
     a, b, c = xx - mean, yy - mean, zz - mean
     spread = np.sqrt((a * a + b * b + c * c + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
@@ -300,3 +313,19 @@ def _variances(points: Floats, rows: Ints) -> tuple[Floats, Floats, Floats]:
     most = mean + 2 * spread * np.cos(angle)
     least = np.maximum(mean + 2 * spread * np.cos(angle + 2 * np.pi / 3), 0.0)
     return least, 3 * mean - most - least, most
+
+
+def _noise_of_normals(scatter: Floats, least: Floats, second: Floats, most: Floats) -> Floats:
+    """The covariance (3, 3) of normals from `NEIGHBOURS` points, the mean over their scatters (N, 3, 3) with these
+    eigenvalues (N,): the share of the information on translation that is spurious.
+
+    A normal has a variance of λ3 / (λi k) along each axis i of its plane. Along the narrow one it is 0.4 % in a tunnel
+    at 16 beams, where alignment would stop the scanner; along the wide one, in which a scanner that looks ahead sees
+    walls, less: with the narrow one's, sweeps that told how far it went in a corridor were taken to tell nothing.
+    """
+    least, second, most = (values[:, None, None] for values in (least, second, most))
+    eye = np.eye(3)
+    apart = np.maximum((most - least) * (second - least), 1e-6 * most**2)  # a ball has no normal
+    across = (scatter - most * eye) @ (scatter - second * eye) / apart  # the normal times itself
+    inverse = ((most + second) * (eye - across) - scatter + least * across) / (most * second)  # in the plane
+    return np.asarray(np.mean(least * inverse, axis=0) / NEIGHBOURS)

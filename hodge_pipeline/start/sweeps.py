@@ -270,8 +270,8 @@ def _follow_as_told(
     poses, velocity, middle_s = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6)), np.zeros(count)
     found, loose, original = np.zeros(count, bool), np.zeros(count, bool), np.arange(count)
     jumps, middles, in_map_m = list[str](), np.zeros((count, 3)), 0.0
-    begun, strange = first_velocity(voxel_m, timed_sweeps(frames[:WARM_UP], times, clouds, usual_m))
-    tracker = ScanToMap(voxel_m, begun)
+    begun, spread, strange = first_velocity(voxel_m, timed_sweeps(frames[:WARM_UP], times, clouds, usual_m))
+    tracker = ScanToMap(voxel_m, begun, spread)
 
     def read() -> Iterator[tuple[int, float, PointCloud]]:
         latest = 0
