@@ -65,6 +65,17 @@ def test_a_stage_that_fails_prints_no_line(capsys: pytest.CaptureFixture[str]) -
     assert capsys.readouterr().err == ""
 
 
+def test_a_bar_goes_on_where_what_was_done_is_done_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rich took it for finished: its rate stood still, and no time remained."""
+    monkeypatch.setattr(console, "Console", lambda **options: Console(**{**options, "force_terminal": True}))
+    with ProgressBars(quiet=False) as terminal, terminal.stage("sweeps", 10) as advance:
+        advance(10)
+        (task,) = terminal._progress.tasks
+        assert task.finished
+        advance(-8)
+        assert not task.finished and task.completed == 2
+
+
 def test_quiet_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     work(ProgressBars(quiet=True))
     assert capsys.readouterr() == ("", "")

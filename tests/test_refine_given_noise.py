@@ -12,10 +12,11 @@ from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.refine import given_poses
 from hodge_pipeline.refine.given_noise import without_noise
 from hodge_pipeline.refine.guard import Measure
+from hodge_pipeline.refine.uncertainty import reduced_chi2
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Floats, Solution, ViewGraph
 
-COUNT = 50
+COUNT, SHARED = 50, 100.0
 SHARED_SIGMA, OWN_SIGMA = 1e-3, 1e-4
 """Radians and metres: of errors that all edges of a step share, and of an edge's own."""
 STATED = np.eye(6) * 0.2 / 14 / SHARED_SIGMA**2
@@ -60,16 +61,16 @@ def test_rough_poses_lose_their_noise_and_take_over_no_bend_and_a_second_time_st
     measured: tuple[ViewGraph, Solution],
 ) -> None:
     given = rough(5e-3)
-    found = without_noise(*measured, given, FIRSTS)
+    found = without_noise(*measured, given, FIRSTS, SHARED)
     assert found is not None and error_m(found) < 0.7 * error_m(given)
     assert error_m(found) < error_m(measured[1].world_from_cam)
-    assert without_noise(*measured, found, FIRSTS) is found
+    assert without_noise(*measured, found, FIRSTS, SHARED) is found
 
 
 @pytest.mark.parametrize("sigma", [0.0, 3e-4])
 def test_poses_as_exact_as_edges_stay_as_they_are(measured: tuple[ViewGraph, Solution], sigma: float) -> None:
     given = rough(sigma)
-    assert without_noise(*measured, given, FIRSTS) is given
+    assert without_noise(*measured, given, FIRSTS, SHARED) is given
 
 
 @pytest.mark.parametrize("firsts", [FIRSTS, FIRSTS[:0]])
@@ -79,7 +80,7 @@ def test_edges_decide_where_poses_jump_or_bend_by_more_than_both_err(
 ) -> None:
     off = STEPS.copy()
     off[:, 4] += jumps_m
-    assert without_noise(*measured, along(off), firsts) is None
+    assert without_noise(*measured, along(off), firsts, SHARED) is None
 
 
 def test_edges_that_no_cycle_tests_smooth_nothing_but_mend_a_jump(measured: tuple[ViewGraph, Solution]) -> None:
@@ -87,9 +88,9 @@ def test_edges_that_no_cycle_tests_smooth_nothing_but_mend_a_jump(measured: tupl
     tree = graph.select(np.arange(COUNT - 1))
     solution = replace(solution, weights=np.ones(COUNT - 1))
     given = rough(1e-2)
-    assert without_noise(tree, solution, given, FIRSTS) is given
+    assert without_noise(tree, solution, given, FIRSTS, SHARED) is given
     given[20:] = se3.exp(np.array([0, 0, 0, 0, 0.5, 0])) @ given[20:]
-    assert without_noise(tree, solution, given, FIRSTS) is None
+    assert without_noise(tree, solution, given, FIRSTS, SHARED) is None
 
 
 def test_pieces_keep_their_places_and_edges_without_a_covariance_decide(measured: tuple[ViewGraph, Solution]) -> None:
@@ -101,10 +102,21 @@ def test_pieces_keep_their_places_and_edges_without_a_covariance_decide(measured
     component = (np.arange(COUNT) < 20).astype(np.int64)
     pieces = Solution(poses, component, solution.weights[inside])
     given = rough(5e-3)
-    found = without_noise(graph.select(inside), pieces, given, FIRSTS)
+    found = without_noise(graph.select(inside), pieces, given, FIRSTS, SHARED)
     assert found is not None and error_m(found) < 0.7 * error_m(given)
     indefinite = replace(graph, information=graph.information * np.diag([1.0, 1, 1, 1, 1, -1]))
-    assert without_noise(indefinite, solution, given, FIRSTS) is None
+    assert without_noise(indefinite, solution, given, FIRSTS, SHARED) is None
+
+
+def test_edges_that_a_robust_solve_left_out_count_for_nothing(measured: tuple[ViewGraph, Solution]) -> None:
+    """It leaves them a small rest of weight: one 50 m off made the others look 300 times as bad."""
+    graph, solution = measured
+    motions, weights = graph.i_from_j.copy(), np.ones(len(graph.edges))
+    motions[-1, 0, 3] += 50.0
+    weights[-1] = 5e-4
+    told = reduced_chi2(replace(graph, i_from_j=motions), replace(solution, weights=weights))
+    rest = graph.select(np.arange(len(graph.edges) - 1))
+    assert told == pytest.approx(reduced_chi2(rest, replace(solution, weights=weights[:-1])))
 
 
 def decided(measured: tuple[ViewGraph, Solution], given: Floats, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Floats]:
@@ -115,7 +127,7 @@ def decided(measured: tuple[ViewGraph, Solution], given: Floats, monkeypatch: py
     monkeypatch.setattr(given_poses, "held_out_pairs", lambda rounds: [])
     for name in ("against_images", "path_size", "_settled"):
         monkeypatch.setattr(given_poses, name, lambda *arguments: [])
-    work = SimpleNamespace(recipe=SimpleNamespace(scale=1.0, guard=SimpleNamespace(force=False)))
+    work = SimpleNamespace(recipe=SimpleNamespace(scale=1.0, guard=SimpleNamespace(force=False, shared_errors=SHARED)))
     key_frames = SimpleNamespace(world_from_key=given, sequence=np.zeros(COUNT), rows=np.arange(COUNT))
     last = SimpleNamespace(graph=graph, solution=solution, world_from_cam=solution.world_from_cam)
     return given_poses._decision(cast("Any", work), cast("Any", [last]), cast("Any", key_frames))

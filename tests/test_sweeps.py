@@ -284,7 +284,9 @@ def test_key_frames_have_the_points_of_the_sweeps_beside_them() -> None:
     assert [frame.frame_id for frame in thick.frames] == [0, 3, 5, 6]
     for frame, posts in zip(thick.frames, (2, 2, 2, 1), strict=True):
         assert frame.read_points is not None
-        points = frame.read_points().points_in_cam
+        cloud = frame.read_points()
+        points, lent = cloud.points_in_cam, posts - 1
+        assert cloud.no_numbers == lent, "the neighbours' points without a return"
         assert points.dtype == np.float32 and len(points) == posts + 2  # no return, and what is too near, its own alone
         pose = poses[int(frame.frame_id)]
         assert se3.transform(pose, points)[[0, *range(3, len(points))]] == pytest.approx(np.tile(post, (posts, 1)))

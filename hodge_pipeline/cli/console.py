@@ -107,7 +107,14 @@ class ProgressBars:
         before = self._totals[title] = self._totals.get(title, 0)
         self._totals[title] += total
         self._progress.update(task, total=self._totals[title])
-        yield lambda done: self._progress.advance(task, done)
+
+        def advance(done: int) -> None:
+            self._progress.advance(task, done)
+            if done < 0:  # rich takes what was once complete for finished
+                own = next(one for one in self._progress.tasks if one.id == task)
+                own.finished_time = own.finished_speed = None
+
+        yield advance
         self._progress.update(task, completed=before + total)
 
     def note(self, note: Note) -> None:

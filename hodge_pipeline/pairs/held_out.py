@@ -31,6 +31,12 @@ class GuardOptions:
         lt=1,
         description="share of the overlapping pairs that are never registered: on them both sets of poses are scored",
     )
+    shared_errors: float = Field(
+        default=100.0,
+        gt=0,
+        description="times what edges leave over that they may err by, as errors that all edges of a frame share close "
+        "every cycle: given poses that are no farther off keep their shape",
+    )
     force: bool = Field(default=False, description="write the result even where it is worse by its own measures")
 
 

@@ -141,8 +141,7 @@ class _Candidates:
 
         An adjustment that begins near an optimum leaves parts where they were; one that goes far moves them at will.
         """
-        models = self._start, self._start.moved(resected)
-        self._lays_parts = all(np.median(one.quality.errors_px) > LEAST_CAP_PX for one in models)
+        self._lays_parts = self._known is None and _is_far(self._start) and _is_far(self._start.moved(resected))
 
     def add(
         self,
@@ -191,6 +190,10 @@ class _Candidates:
             return found, adjusted
         adjusted = in_frame_of(self._start, laid.read_back(again.folder, again.notes))
         return again, parts_laid_on(likeliest(self._start.world_from_body, adjusted), adjusted)
+
+
+def _is_far(model: TrackedModel) -> bool:
+    return bool(np.median(model.quality.errors_px) > LEAST_CAP_PX)
 
 
 def make_candidates(

@@ -61,8 +61,8 @@ def _has_baselines(model: TrackedModel) -> bool:
 
 
 def similarity(after: Floats, before: Floats, keeps_size: bool) -> tuple[float, Floats]:
-    """The factor and then the motion (4, 4) that lay poses after on those before (B, 4, 4); not positive where the
-    latter are all in one place.
+    """The factor and then the motion (4, 4) that lay poses after on those before (B, 4, 4); not positive where the size
+    is free and the latter are all in one place.
 
     The most likely one by positions and turns whose errors follow Student's t, of sizes that the fit tells: a row
     of cameras leaves the turn about its axis to their turns, and its other turns to their positions.
@@ -70,7 +70,7 @@ def similarity(after: Floats, before: Floats, keeps_size: bool) -> tuple[float, 
     x, y = after[:, :3, 3], before[:, :3, 3]
     turns = before[:, :3, :3] @ np.swapaxes(after[:, :3, :3], 1, 2)
     of_position = of_turn = np.ones(len(x))
-    scale, off2, turn2 = 1.0, float(np.sum((y - y.mean(axis=0)) ** 2)), 1.0  # at first a turn by 1 rad for the extent
+    scale, off2, turn2 = 1.0, float(np.sum((y - y.mean(axis=0)) ** 2)) or 1.0, 1.0  # at first 1 rad for the extent
     for _ in range(ROUNDS):
         centre_x, centre_y = (np.average(one, axis=0, weights=of_position) for one in (x, y))
         covariance = (y - centre_y).T @ (of_position[:, None] * (x - centre_x))

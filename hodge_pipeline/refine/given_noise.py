@@ -20,11 +20,11 @@ from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Floats, Ints, Priors, Solution, ViewGraph
 from hodge_pipeline.types.arrays import evenly
 
-STATED_SHARE, SHARED = 0.2, 100.0
-"""Least share of the stated variances that counts, and least times what the edges leave over; where no cycle tests the
-edges, all that they state. Errors that all edges of a frame share, as of shutter, sampling and the delay between depth
-and colour, close every cycle. In 111 runs in ten rendered rooms and drives, from true and from disturbed poses, 0.8 of
-these variances covered every pair's error in four of five, and 1.7 of them in 95 of a hundred.
+STATED_SHARE = 0.2
+"""An edge's variance is taken to be this share of the stated one, or `GuardOptions.shared_errors` times what edges
+leave over (reduced χ²), whichever is larger; where no cycle tests the edges, the stated one. Errors that all edges of a
+frame share, as of shutter, sampling and the delay between depth and colour, close every cycle: true poses are off by 9
+to 84 times what edges leave over in rendered rooms, by 1 to 9 times in drives of a LiDAR.
 """
 FARTHER, CHANCE = 2.5, 0.01
 """Times the variance of edges and noise by which given poses are farther off than these, and the chance that any pair
@@ -37,13 +37,16 @@ LEAST = 1e-6
 """Share of the larger variance, of rotations or translations, below which poses are as good as held."""
 
 
-def without_noise(graph: ViewGraph, solution: Solution, given: Floats, firsts: Ints) -> Floats | None:
+def without_noise(
+    graph: ViewGraph, solution: Solution, given: Floats, firsts: Ints, shared_errors: float
+) -> Floats | None:
     """The given poses (K, 4, 4) less their white noise, where it exceeds that of the edges, which led to the solution;
-    `firsts (S,)`: the rows that are followed by another one of their sequence.
+    `firsts (S,)`: the rows that are followed by another one of their sequence; `shared_errors`: of `GuardOptions`.
 
-    None where edges decide alone: some pair, whatever its distance, is farther from where they put it than both err.
+    The very array given, where its noise is no larger or where no cycle tests the edges. None where edges decide alone:
+    some pair, whatever its distance, is farther from where they put it than both err.
     """
-    edges = _weakened(graph, solution)
+    edges = _weakened(graph, solution, shared_errors)
     component = connected_components(edges.edges, edges.vertex_count)
     octaves = _octaves(component)
     try:
@@ -60,10 +63,10 @@ def without_noise(graph: ViewGraph, solution: Solution, given: Floats, firsts: I
     return solve(edges, start=given, initial="given", priors=priors).world_from_cam
 
 
-def _weakened(graph: ViewGraph, solution: Solution) -> ViewGraph:
+def _weakened(graph: ViewGraph, solution: Solution, shared_errors: float) -> ViewGraph:
     """The edges used, with the information that they have with the errors that they share."""
-    used, reduced = np.flatnonzero(solution.weights > 0), reduced_chi2(graph, solution)
-    share = 1.0 if np.isnan(reduced) else max(STATED_SHARE, SHARED * reduced)
+    used, reduced = np.flatnonzero(solution.kept), reduced_chi2(graph, solution)
+    share = 1.0 if np.isnan(reduced) else max(STATED_SHARE, shared_errors * reduced)
     weights = solution.weights[used] / share
     return replace(graph.select(used), information=graph.information[used] * weights[:, None, None])
 

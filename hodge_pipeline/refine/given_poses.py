@@ -75,7 +75,9 @@ def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
     nothing = _nothing(last)
     if nothing or last.solution is None:
         return Decision("nothing", nothing), before
-    smoothed = without_noise(last.graph, last.solution, before, first_of_steps(key_frames))
+    smoothed = without_noise(
+        last.graph, last.solution, before, first_of_steps(key_frames), work.recipe.guard.shared_errors
+    )
     solved = last.world_from_cam if smoothed is None or smoothed is before else smoothed
     chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, solved)]
     after, measures = _held_out(work, held_out_pairs(rounds), key_frames, solved)

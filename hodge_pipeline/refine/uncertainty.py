@@ -30,11 +30,12 @@ def mean_chi2(graph: ViewGraph, weights: Floats, world_from_cam: Floats) -> floa
 
 def reduced_chi2(graph: ViewGraph, solution: Solution) -> float:
     """The weighted χ² of the edges used, by their degrees of freedom beyond those of the poses; NaN of a tree."""
-    used = int(solution.kept.sum())
-    freedom = 6 * (used - graph.vertex_count + 1 + int(solution.component.max(initial=0)))
+    used = np.flatnonzero(solution.kept)
+    freedom = 6 * (len(used) - graph.vertex_count + 1 + int(solution.component.max(initial=0)))
     if freedom <= 0:
         return float("nan")
-    return float(solution.weights @ chi2_by_information(graph, solution.world_from_cam)) / freedom
+    chi2 = chi2_by_information(graph.select(used), solution.world_from_cam)
+    return float(solution.weights[used] @ chi2) / freedom
 
 
 def pose_change(graph: ViewGraph, solution: Solution, before: Floats) -> PoseChange:

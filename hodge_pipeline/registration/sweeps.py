@@ -121,7 +121,9 @@ def joined_frame(frame: Frame, others: Sequence[Frame], frame_from_other: Floats
 def _read_joined(
     read: Callable[[], PointCloud], reads: list[Callable[[], PointCloud]], motions: Floats, options: CloudOptions
 ) -> PointCloud:
-    own, others = read(), [in_range(one(), options) for one in reads]
+    own, whole = read(), [one() for one in reads]
+    others = [in_range(one, options) for one in whole]
+    no_returns = sum(one.no_numbers + int((~one.points_in_cam.any(axis=1)).sum()) for one in whole)
     moved = [
         se3.transform(motion, np.asarray(one.points_in_cam, float)) for motion, one in zip(motions, others, strict=True)
     ]
@@ -132,6 +134,7 @@ def _read_joined(
         normals_in_cam=None,
         colours=np.concatenate(colours) if len(colours) == 1 + len(others) else None,
         times_s=None,
+        no_numbers=own.no_numbers + no_returns,  # of as many sweeps as the points
     )
 
 

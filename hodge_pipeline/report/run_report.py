@@ -66,8 +66,8 @@ def make_report(
 ) -> Report:
     """Everything that the run measured, `world_from_cam (N, 4, 4)` being the poses that it ends with."""
     last, source = rounds[-1], scene.source
-    sets = pose_sets(rounds, source)
     kept = refined is not None and refined.decision.keeps_input
+    sets = _shown(rounds, scene, world_from_cam, is_refined=refined is not None and not kept)
     assert last.solution is not None
     component = last.solution.component
     worst = worst_edges(last.edges, last.vertex_ids)
@@ -99,6 +99,14 @@ def make_report(
         refinement=None if refined is None else summary(refined.decision),
         shows_rejected=kept,
     )
+
+
+def _shown(rounds: Sequence[Round], scene: Scene, world_from_cam: Floats, *, is_refined: bool) -> dict[str, Floats]:
+    """The poses of the key frames by name; the result of a refinement is what it writes, not its last round's: a
+    correction of fewer knots, or the given poses less their noise.
+    """
+    sets = pose_sets(rounds, scene.source)
+    return {**sets, "result": world_from_cam[scene.key_frames.rows]} if is_refined else sets
 
 
 def _source_summary(recipe: Recipe, scene: Scene) -> SourceSummary:
@@ -137,7 +145,6 @@ def _trajectories(
     if not has_truth(scene.whole):
         return ()
     if scene.given is not None:
-        sets = {**sets, "result": final[scene.key_frames.rows]}
         return _of_file(scene.given, scene.key_frames, sets, recipe.evaluation.rpe_delta_frames, kept=kept)
     every = {name: scene.key_frames.expand(poses) for name, poses in sets.items()} | {"result": final}
     if has_given(scene.source):

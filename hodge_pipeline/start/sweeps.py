@@ -39,7 +39,6 @@ from hodge_pipeline.scene import (
     KeyFrames,
     Scene,
     is_clock,
-    key_source,
     sequence_numbers,
     sequences_of,
     stamps_of,
@@ -134,8 +133,6 @@ class SweepsStart(OdometryStart):
         steps.remember(whole, steps.key([source, found]) + "deskewed")
         apart_m = found.reach_m / KEY_FRAMES_IN_REACH if self.distance_m is None else self.distance_m
         rows = key_rows(found, sequences, apart_m, self.angle_deg)
-        keys = key_source(whole, rows)
-        steps.remember(keys, steps.key([whole, rows]))
         steps.note(Note("key frames", len(rows), str(len(frames))))
         thick = thickened(whole, rows, found, sequences, clouds)
         steps.remember(thick, steps.key([whole, rows]) + "thickened")
@@ -167,7 +164,8 @@ def thickened(whole: Source, rows: Ints, found: Sweeps, sequences: tuple[Ints, .
         for place in np.flatnonzero(np.isin(read, rows)).tolist():
             row, around = read[place], np.delete(read[max(place - 1, 0) : place + 2], min(place, 1))
             key_from_sweep = se3.inverse(found.world_from_scan[row]) @ found.world_from_scan[around]
-            near = np.linalg.norm(key_from_sweep[:, :3, 3], axis=1) < BESIDE * found.reach_m
+            apart_m = np.linalg.norm(key_from_sweep[:, :3, 3], axis=1)
+            near = (apart_m > 0) & (apart_m < BESIDE * found.reach_m)  # a sweep that is written twice lends nothing
             frames[row] = joined_frame(
                 whole.frames[row], [whole.frames[other] for other in around[near]], key_from_sweep[near], clouds
             )

@@ -16,7 +16,7 @@ class Watcher(Protocol):
     """Receives the begin, progress and end of each stage, and notes."""
 
     def stage(self, title: str, total: int) -> AbstractContextManager[Advance]:
-        """A context whose value is called with the units just finished, of `total` in all."""
+        """A context whose value is called with the units just finished, of `total` in all; see `Advance`."""
 
     def note(self, note: Note) -> None:
         """A fact, as soon as it is known."""

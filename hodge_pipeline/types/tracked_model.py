@@ -84,8 +84,9 @@ class TrackedModel(Protocol):
         """The model in another unit of length, then moved as a whole by `motion` (4, 4)."""
 
     def scaled_parts(self, part: Ints, factors: Floats, motions: Floats) -> TrackedModel:
-        """The same of each part (B,) of the bodies, with the points they see, by its own factor (G,) and motion (G, 4,
-        4); a point of several parts is where their rays then meet.
+        """The positions of each part (B,) of the bodies, with the points they see, times its own factor (G,), then
+        moved (G, 4, 4); a point of several parts is where their rays then meet. Rigs keep their baselines: factors are
+        1 where there are any.
         """
 
     def placed(self) -> TrackedModel:

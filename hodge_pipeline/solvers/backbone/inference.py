@@ -244,7 +244,7 @@ def _single_joins(chain: Chain, used: Bools) -> Bools:
 
 
 REARRANGED = 3
-"""Times that the loops are judged, before and after places are left out or added: a limit on cost."""
+"""Times that the loops are judged, before and after places are left out: a limit on cost."""
 MOST_GROWN = 30
 """Rounds in which loops are added: a limit on cost."""
 
