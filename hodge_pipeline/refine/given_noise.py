@@ -43,8 +43,8 @@ def without_noise(
     """The given poses (K, 4, 4) less their white noise, where it exceeds that of the edges, which led to the solution;
     `firsts (S,)`: the rows that are followed by another one of their sequence; `shared_errors`: of `GuardOptions`.
 
-    The very array given, where its noise is no larger or where no cycle tests the edges. None where edges decide alone:
-    some pair, whatever its distance, is farther from where they put it than both err.
+    The very array given, where its noise is no larger. None where edges decide alone: some pair, whatever its distance,
+    is farther from where they put it than both err.
     """
     edges = _weakened(graph, solution, shared_errors)
     component = connected_components(edges.edges, edges.vertex_count)
@@ -56,7 +56,7 @@ def without_noise(
     white = _white(solution, given, firsts[component[firsts] == component[firsts + 1]])
     if _farther(solution, given, np.concatenate(octaves), np.concatenate(covariances), white):
         return None
-    if np.isnan(reduced_chi2(graph, solution)) or not (white > _white_at_most(covariances[0])).any():
+    if not (white > _white_at_most(covariances[0])).any():
         return given
     information = np.diag(np.repeat(1 / np.maximum(white, LEAST * white.max()), 3))
     priors = Priors(np.arange(len(given)), given, np.tile(information, (len(given), 1, 1)))
