@@ -23,7 +23,7 @@ from hodge_pipeline.start.sweeps import Sweeps, follow
 from hodge_pipeline.types import Floats, Frame, Ints, PointCloud, Source
 
 Sweeping = Sequence[tuple[int, float, PointCloud]]
-JUDGE = "hodge_pipeline.start.sweeps.sense_of_times"
+JUDGE = "hodge_pipeline.start.sweep_times.sense_of_times"
 COUNT, SPEED_M_S, UNIX_S = 24, 10.0, 1.7e9
 NEAR_M = 0.1
 """Whole sequences are off by 0.02 m; a sweep followed from a wrong velocity by half a metre and more."""

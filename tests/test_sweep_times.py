@@ -28,7 +28,7 @@ from hodge_pipeline.registration.sweeps import (
     velocities_along,
 )
 from hodge_pipeline.stages import Steps
-from hodge_pipeline.start.sweeps import deskewed_along
+from hodge_pipeline.start.sweep_times import deskewed_along
 from hodge_pipeline.types import Floats, PointCloud, Source
 from hodge_pipeline.types.notes import Note
 from hodge_pipeline.uses.trajectory import refine_trajectory

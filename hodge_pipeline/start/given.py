@@ -37,7 +37,7 @@ from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.match_poses import Match, Matched, match_poses, own_poses
 from hodge_pipeline.start.odometry import OPTIONS, chain
-from hodge_pipeline.start.sweeps import deskewed_along
+from hodge_pipeline.start.sweep_times import deskewed_along
 from hodge_pipeline.types import Bools, Edges, Floats, Ints, Source, Trajectory
 from hodge_pipeline.types.notes import Note, notes_of
 from hodge_pipeline.types.text import counted

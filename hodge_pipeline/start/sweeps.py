@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 from scipy.ndimage import maximum_filter1d
@@ -18,14 +17,12 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.registration.cloud_set import shortened
 from hodge_pipeline.registration.clouds import CloudOptions, Oddity
-from hodge_pipeline.registration.following import first_velocity, followed, sense_of_times
+from hodge_pipeline.registration.following import first_velocity, followed
 from hodge_pipeline.registration.gaps import told_gaps
 from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, OdometryOptions, chained
 from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.registration.scan_to_map import ScanToMap
 from hodge_pipeline.registration.sweeps import (
-    BACKWARDS,
-    FORWARDS,
     UNUSED,
     deskewed_frame,
     first_after_s,
@@ -33,7 +30,6 @@ from hodge_pipeline.registration.sweeps import (
     off_neighbours_m,
     retimed_frame,
     velocities,
-    velocities_along,
 )
 from hodge_pipeline.scene import (
     KeyFrames,
@@ -44,7 +40,7 @@ from hodge_pipeline.scene import (
     stamps_of,
     vertex_ids,
 )
-from hodge_pipeline.stages import Advance, Step, Steps, Workers, no_progress
+from hodge_pipeline.stages import Advance, Step, Steps, Workers
 from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
@@ -52,25 +48,20 @@ from hodge_pipeline.start.sweep_reading import (
     LEFT_OUT,
     NO_CLOCK_S,
     REVOLUTION_S,
-    Look,
     begun_s,
     first_look,
     read_sweeps,
     timed_sweeps,
 )
+from hodge_pipeline.start.sweep_times import AS_TOLD, WARM_UP, finest_voxel_m, notes_of_times, times_along
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Ints, PointCloud, Source
 from hodge_pipeline.types.notes import Note, notes_of
 
-VOXELS_IN_REACH, KEY_FRAMES_IN_REACH = 100, 40
-"""The reach of the scanner over the voxel and over the key-frame distance: 0.8 m, as in KISS-ICP (Vizzo et al., RA-L
-2023), and 2 m at 80 m."""
+KEY_FRAMES_IN_REACH = 40
+"""The reach of the scanner over the key-frame distance: 2 m at 80 m."""
 BESIDE = 0.1
 """Share of the reach within which a sweep beside a key frame lends it its points: 5 m on a street, a step at 50 m/s.
 One after a hole is placed less well."""
-SMALLEST_VOXEL_M = 0.08
-"""Four times the usual noise of a range, 2 cm: smaller voxels, as in a room, would hold noise in place of surfaces."""
-WARM_UP = 20
-"""Sweeps that the first velocity is found on."""
 STRANGE = "it fits none of the sweeps around it, and these fit each other: is it of another place?"
 MOST_LOOSE = 0.5
 """Share of sweeps that tell little of how far the scanner went, above which the whole path is in doubt."""
@@ -84,8 +75,6 @@ IN_MAP_REACH = 0.1
 are in map coordinates: of a scanner at rest they move with what passes, of one in motion it moves by more."""
 TOLD = 5
 """Unevenly placed sweeps that are named."""
-AS_TOLD = 0.0, FORWARDS
-"""How the times of points are read (`retimed_frame`) where nothing is sure to be better."""
 
 
 @plain_dataclass(frozen=True)
@@ -204,20 +193,10 @@ def follow(
         step.note(Note("sweeps in map", 1, f"{in_map_m:.3g} m"))
     clocked = [rows for rows in sequences if is_clock(stamps[rows])]
     step.note(*told_gaps(clocked, stamps, vertex_ids(source)))
-    step.note(*_notes_of_times(revolution_s, sense))
+    step.note(*notes_of_times(revolution_s, sense))
     if not any(part.is_timed for part in parts):
         step.note(Note("sweeps untimed"))
     return Sweeps(poses, velocity, found, revolution_s, sense, min(part.reach_m for part in parts))
-
-
-def _notes_of_times(revolution_s: Floats, sense: Ints) -> list[Note]:
-    """How many sweeps have times of points other than those told, by `retimed_frame`."""
-    counts = {
-        "times by order": revolution_s > 0,
-        "times backwards": sense == BACKWARDS,
-        "times unused": sense == UNUSED,
-    }
-    return [Note(kind, int(where.sum()), str(len(sense))) for kind, where in counts.items() if where.any()]
 
 
 class _Followed(NamedTuple):
@@ -245,13 +224,13 @@ def _follow_one(
 ) -> _Followed:
     """One sequence, its points timed as told; followed again where its fastest sweeps are sure of other times."""
     look = first_look(frames, stamps_s, clouds)
-    voxel = voxel_m or max(look.reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
+    voxel = voxel_m or finest_voxel_m(look.reach_m)
     times = begun_s(stamps_s, 0.0 if look.revolution_s else look.turn_s)
     part = _follow_as_told(frames, times, clouds, voxel, look.reach_m, advance)
     read = np.flatnonzero(part.found)
     turning = begun_s(stamps_s, look.turn_s)
     velocity = part.velocity[read] * (times[-1] / turning[-1] if turning[-1] else 1.0)
-    told = _times_along([frames[row] for row in read], velocity, turning[read], clouds, voxel, look, advance)
+    told = times_along([frames[row] for row in read], velocity, turning[read], clouds, voxel, look, advance)
     if told == AS_TOLD:
         return part
     times = turning if told[1] != UNUSED else begun_s(stamps_s, 0.0)
@@ -323,62 +302,6 @@ def _jumps(names: list[str], poses: Floats, times_s: Floats, voxel_m: float) -> 
     uneven &= off_m > GRIP_M_S2 / 2 * around  # never at the ends
     uneven &= off_m >= maximum_filter1d(off_m, 3)  # a displaced pose puts those beside it off by half
     return [f"{names[row]}: {off_m[row]:.2f} m" for row in np.flatnonzero(uneven)]
-
-
-def deskewed_along(source: Source, world_from_scan: Floats, clouds: CloudOptions, steps: Steps) -> Source:
-    """The source with sweeps whose points have times deskewed to their stamps, by velocities from poses (N, 4, 4).
-
-    The poses may be noisy, see `velocities_along`. Notes where sweeps in motion have no times, or other ones than told.
-    """
-    count, stamps, is_untimed = len(source.frames), stamps_of(source), False
-    velocity, revolution_s, sense = np.zeros((count, 6)), np.zeros(count), np.ones(count, np.int64)
-    for rows in sequences_of(source).values():
-        frames = [source.frames[row] for row in rows]
-        halfway = frames[len(rows) // 2]
-        if len(rows) < 2 or halfway.read_points is None:
-            continue
-        turns = is_clock(stamps[rows]) and np.median(np.diff(stamps[rows])) < NO_CLOCK_S
-        look = first_look([halfway], stamps[rows], clouds)
-        if look.turn_s and (turns or not (look.revolution_s and is_clock(stamps[rows]))):
-            times = begun_s(stamps[rows], look.turn_s)
-            middle_s = first_after_s(halfway.read_points(), halfway.stamp_s) + look.turn_s / 2
-            velocity[rows] = velocities_along(world_from_scan[rows], times, times + middle_s, look.reach_m)
-            voxel_m = max(look.reach_m / VOXELS_IN_REACH, SMALLEST_VOXEL_M)
-            revolution_s[rows], sense[rows] = _times_along(frames, velocity[rows], times, clouds, voxel_m, look)
-        in_use = revolution_s[rows[0]] > 0 if look.revolution_s else look.turn_s > 0 and sense[rows[0]] != UNUSED
-        is_untimed |= bool(turns and not in_use)
-    for note in _notes_of_times(revolution_s, sense) + [Note("sweeps untimed")] * is_untimed:
-        steps.note(note)
-    if not velocity.any():
-        return source
-    timed = map(retimed_frame, source.frames, revolution_s.tolist(), sense.tolist())
-    return replace(source, frames=tuple(map(deskewed_frame, timed, velocity)))
-
-
-def _times_along(
-    frames: list[Frame],
-    velocity: Floats,
-    times: Floats,
-    clouds: CloudOptions,
-    voxel_m: float,
-    look: Look,
-    advance: Advance = no_progress,
-) -> tuple[float, int]:
-    """How the times of points are read (`retimed_frame`), by those `WARM_UP` sweeps in a row that skew moves farthest.
-
-    Times by the order of points, and others than those told, are taken only where the map is sure of them: sweeps may
-    have been deskewed before.
-    """
-    if not look.turn_s or not len(frames):
-        return AS_TOLD
-    skew_m = np.abs(velocity) @ np.repeat([look.reach_m, 1.0], 3)
-    in_a_row = sliding_window_view(skew_m, min(WARM_UP, len(frames)))
-    first = int(np.argmax(np.median(in_a_row, axis=1)))
-    part = [retimed_frame(frame, look.revolution_s) for frame in frames[first : first + WARM_UP]]
-    sweeps = timed_sweeps(part, times[first:], clouds, look.reach_m)
-    told = UNUSED if look.revolution_s else FORWARDS
-    sense = sense_of_times(voxel_m, velocity[first], told, sweeps, advance)
-    return AS_TOLD if sense == told else (look.revolution_s, sense)
 
 
 def register_steps(
