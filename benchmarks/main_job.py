@@ -1,11 +1,11 @@
 """What the main job costs and reaches: CPU seconds a frame by part, memory, errors and scores of one run or of several.
 
-    python benchmarks/main_job.py tum=fr1_xyz seven_scenes=redkitchen video --open3d
+    python benchmarks/main_job.py tum=fr1_xyz seven_scenes=redkitchen video --open3d --orb-slam3
     python benchmarks/main_job.py demo=SEQUENCE --frames 1000 5000 20000 --plot length.svg
 
 Each is RECIPE=PATH, or the word video: the sequence of `hodge demo --video`. All its frames are run in a fresh process,
-or the first N; one that has fewer is played back and forth. Beside consecutive frames Open3D's RGB-D odometry can be
-run. The tables are Markdown, the plot shows time and memory against frames.
+or the first N; one that has fewer is played back and forth. Beside consecutive frames Open3D's RGB-D odometry and
+ORB-SLAM3 (see `orb_slam3.py`) can be run. The tables are Markdown, the plot shows time and memory against frames.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -74,21 +76,46 @@ def measure(recipe: str, source: Path, frames: int, overrides: list[str], keep: 
     }
 
 
-def open3d_odometry(recipe_name: str, path: Path, frames: int, overrides: list[str]) -> str:
-    """The row of Open3D's odometry; an empty one where the frames are not consecutive."""
+def peer_row(peer: str, recipe_name: str, path: Path, frames: int, overrides: list[str]) -> str:
+    """The row of this peer, a dash for what it does not give; empty where the frames are not consecutive."""
     import numpy as np
 
     from benchmarks.back_and_forth import first_frames
-    from benchmarks.open3d_odometry import open3d_row
+    from hodge_pipeline.evaluation.trajectory import absolute_error, relative_error
     from hodge_pipeline.recipe.schema import load_recipe
-    from hodge_pipeline.scene import has_real_stamps
+    from hodge_pipeline.scene import has_real_stamps, true_poses
     from hodge_pipeline.sources.opening import open_with_reader
 
     whole, _ = open_with_reader(path, load_recipe(recipe_name, overrides, path).source.reader)
     step = float(np.median(np.diff([frame.stamp_s for frame in whole.frames])))
     if step > (CONSECUTIVE_S if has_real_stamps(whole.frames) else 1.0):
         return ""
-    return open3d_row(first_frames(whole, frames or len(whole.frames)))
+    source = first_frames(whole, frames or len(whole.frames))
+    truth, count = true_poses(source), len(source.frames)
+    poses, lost, cpu_s = PEERS[peer](source)
+    note, cells = f", {lost} lost" if lost else "", "– | – | – | –"
+    if np.isfinite(truth).any():
+        error, moved = absolute_error(poses, truth), relative_error(poses, truth)
+        cells = (
+            f"{100 * error.rmse_m:.2f} | {100 * error.max_m:.1f} | {1e3 * moved.translation_rmse_m:.1f} | "
+            f"{moved.rotation_rmse_deg:.2f}"
+        )
+    return f"| {peer}{note} | {count} | {cpu_s:.1f} | {1e3 * cpu_s / count:.0f} | – | – | – | {cells} | – |\n"
+
+
+def _by_open3d(source: Any) -> Any:
+    from benchmarks.open3d_odometry import tracked_by_open3d
+
+    return tracked_by_open3d(source)
+
+
+def _by_orb_slam3(source: Any) -> Any:
+    from benchmarks.orb_slam3 import tracked_by_orb_slam3
+
+    return tracked_by_orb_slam3(source)
+
+
+PEERS = {"Open3D's odometry": _by_open3d, "ORB-SLAM3": _by_orb_slam3}
 
 
 def errors(report: dict[str, Any]) -> str:
@@ -169,7 +196,9 @@ def main() -> None:
     parser.add_argument("sources", type=job, nargs="+", metavar="RECIPE=PATH")
     parser.add_argument("--frames", type=int, nargs="+", default=[0], help="how many are run; 0: all")
     parser.add_argument("--repeat", type=int, default=1, help="runs of each; that of the median CPU time is printed")
-    parser.add_argument("--open3d", action="store_true", help="Open3D's odometry beside those of consecutive frames")
+    for flag, peer in zip(("--open3d", "--orb-slam3"), PEERS, strict=True):
+        text = f"{peer} beside those of consecutive frames"
+        parser.add_argument(flag, dest="peers", action="append_const", const=peer, default=[], help=text)
     parser.add_argument("--plot", type=Path, help="an SVG file: CPU seconds and peak memory against frames")
     parser.add_argument("--keep", type=Path, help="a folder that keeps the runs")
     parser.add_argument("--set", dest="overrides", action="append", default=[])
@@ -184,8 +213,11 @@ def main() -> None:
             run = next(run for run in repeated if run["total_cpu_s"] == cpu_s)
             kept[f"{name}, {run['frames']}"] = run
             print(row(name, run), flush=True)
-            peer = open3d_odometry(recipe, path, frames, options.overrides) if options.open3d else ""
-            print(peer + "\n" * bool(peer), end="", flush=True)
+            for peer in options.peers:
+                # in a process of its own: a second ORB-SLAM3 of one process goes astray
+                with ProcessPoolExecutor(1, get_context("spawn")) as fresh:
+                    line = fresh.submit(peer_row, peer, recipe, path, frames, options.overrides).result()
+                print(line, end="", flush=True)
             if options.plot:
                 points = [
                     (one["frames"], one["total_cpu_s"], max(stage["peak_mb"] for stage in one["stages"]))

@@ -7,33 +7,16 @@ import time
 import numpy as np
 import open3d as o3d
 
-from hodge_pipeline.evaluation.trajectory import absolute_error, relative_error
-from hodge_pipeline.scene import true_poses
 from hodge_pipeline.types import Floats, Frame, Source
 
 DEPTH_LIMIT_M = 6.0
 
 
-def open3d_row(source: Source) -> str:
-    """A row of the main job's table: frames, CPU seconds in all and a frame, errors; a dash for what it does not give.
-
-    A pair that it cannot register keeps the pose of the frame before, and is counted.
+def tracked_by_open3d(source: Source) -> tuple[Floats, int, float]:
+    """The poses (N, 4, 4), how many pairs it cannot register, which keep the pose of the frame before, and its CPU
+    seconds, reading of frames included.
     """
-    begin = time.process_time()
-    poses, lost = _chained(source.frames)
-    cpu_s = time.process_time() - begin
-    truth, count = true_poses(source), len(source.frames)
-    note, errors = f", {lost} pairs lost" if lost else "", "– | – | – | –"
-    if np.isfinite(truth).any():
-        error, step = absolute_error(poses, truth), relative_error(poses, truth)
-        errors = (
-            f"{100 * error.rmse_m:.2f} | {100 * error.max_m:.1f} | {1e3 * step.translation_rmse_m:.1f} | "
-            f"{step.rotation_rmse_deg:.2f}"
-        )
-    return f"| Open3D's odometry{note} | {count} | {cpu_s:.1f} | {1e3 * cpu_s / count:.0f} | – | – | – | {errors} | – |"
-
-
-def _chained(frames: tuple[Frame, ...]) -> tuple[Floats, int]:
+    frames, begin_cpu = source.frames, time.process_time()
     poses, lost = [np.eye(4)], 0
     before = _image(frames[0])
     for frame in frames[1:]:
@@ -48,7 +31,7 @@ def _chained(frames: tuple[Frame, ...]) -> tuple[Floats, int]:
         lost += not found
         poses.append(poses[-1] @ (before_from_this if found else np.eye(4)))
         before = image
-    return np.array(poses), lost
+    return np.array(poses), lost, time.process_time() - begin_cpu
 
 
 def _image(frame: Frame) -> o3d.geometry.RGBDImage:
