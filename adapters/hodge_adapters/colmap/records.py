@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types import Bools, Floats, Ints
 
 NO_POINT = -1
 """COLMAP's mark of an observation of no point, 2^64 − 1, as a signed number."""
@@ -60,6 +60,11 @@ class Points:
     def owners(self) -> Ints:
         """The row (T,) of the point that each entry of a track belongs to."""
         return np.repeat(np.arange(len(self.ids)), np.diff(self.offsets))
+
+    def seen_by(self, kept: Bools) -> Points:
+        """The points with these entries (T,) of their tracks alone."""
+        counts = np.bincount(self.owners[kept], minlength=len(self.ids))
+        return Points(self.ids, self.xyz, np.r_[0, np.cumsum(counts)], self.image_ids[kept], self.columns[kept])
 
     def rows_of(self, ids: Ints) -> Ints:
         """The rows (N,) of points by their ids (N,), −1 of those that are not there."""

@@ -128,8 +128,7 @@ def _derivatives(model: Model, bodies: Bodies, used: Bools) -> Iterator[tuple[in
         ]
         slopes = [(ahead - behind) / (2 * step) for ahead, behind in ends]
         by_body_point = np.stack(slopes, axis=2) @ cam_from_body[:3, :3]
-        # a body at T exp(ξ) sees the point at x − φ × x − ρ
-        motion = np.concatenate([se3.hat(in_body), np.broadcast_to(-np.eye(3), (len(here), 3, 3))], axis=2)
         good = np.isfinite(by_body_point).all(axis=(1, 2))
         by_point = by_body_point @ body_from_world[:3, :3]
-        yield number, _Rows((by_body_point @ motion)[good], by_point[good], owner[here][good])
+        # a body at T exp(ξ) sees the point at exp(−ξ) x
+        yield number, _Rows((-by_body_point @ se3.by_twist(in_body))[good], by_point[good], owner[here][good])
