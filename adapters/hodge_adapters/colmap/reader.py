@@ -133,7 +133,7 @@ class ColmapReader:
         if self.depth != "none" and 0 < len(readable) < len(depths):
             notes.append(f"{len(depths) - len(readable)} of {len(depths)} images have no depth")
         scale = self._scale(model, depths, notes)
-        poses = se3.rescaled(np.array([image.world_from_cam for image in model.images]), scale)
+        poses = se3.rescaled(model.world_from_cam, scale)
         sizes = _sizes(model, depths)
         try:
             frames = tuple(

@@ -84,6 +84,11 @@ class Model:
     files: tuple[Path, ...] = ()
     notes: tuple[str, ...] = ()
 
+    @property
+    def world_from_cam(self) -> Floats:
+        """The poses (N, 4, 4) of the images."""
+        return np.array([image.world_from_cam for image in self.images]).reshape(-1, 4, 4)
+
     @cached_property
     def image_rows(self) -> Ints:
         """The row (T,) of the image that each entry of a track names."""

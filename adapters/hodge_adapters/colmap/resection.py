@@ -52,8 +52,7 @@ def _seen_by_others(model: Model, bodies: Bodies, chosen: Bools) -> Model:
     points, owner = model.points, model.points.owners
     other = ~chosen[bodies.body_of_image[model.image_rows]]
     tracks = points.seen_by(other)
-    poses = np.array([image.world_from_cam for image in model.images])
-    xyz = points_of_rays(replace(model, points=tracks), poses)
+    xyz = points_of_rays(replace(model, points=tracks), model.world_from_cam)
     kept = (np.diff(tracks.offsets) >= 2)[owner]
     return replace(model, points=replace(points.seen_by(kept), xyz=xyz))
 

@@ -60,7 +60,7 @@ def information(model: Model, bodies: Bodies) -> PoseInformation:
 
 def _are_apart(model: Model) -> Bools:
     """Which entries of tracks (T,) have their point farther from the camera than `LEAST_DISTANCE`."""
-    centres = np.array([image.world_from_cam[:3, 3] for image in model.images]).reshape(-1, 3)
+    centres = model.world_from_cam[:, :3, 3]
     away = np.linalg.norm(model.points.xyz[model.points.owners] - centres[model.image_rows], axis=1)
     return np.asarray(away > LEAST_DISTANCE * np.median(away)) if len(away) else np.zeros(0, bool)
 

@@ -72,9 +72,9 @@ class Rival:
     contradicting: float
 
 
-def contradicting(key: FlowImage, view: FlowImage, key_from_view: Floats) -> float:
+def contradicting(key: FlowImage, view: FlowImage, key_from_view: Floats, moments: Moments = AT_REST) -> float:
     """The share of the tested pixels whose depth or grey value contradicts a motion."""
-    return _compared(key, view, key_from_view, AT_REST)[0]
+    return _compared(key, view, key_from_view, moments)[0]
 
 
 def misplaced(key: FlowImage, view: FlowImage, key_from_view: Floats, moments: Moments = AT_REST) -> float:
