@@ -28,6 +28,7 @@ from hodge_pipeline.pairs.edits import Listed, pairs_to_register
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.refine.pose_graph import disabled_edges
 from hodge_pipeline.report import raster
+from hodge_pipeline.report.advice import ranked
 from hodge_pipeline.report.diagnosis_page import PageContents, edge_table, frames_table
 from hodge_pipeline.report.diagnosis_plots import pieces_apart
 from hodge_pipeline.report.edge_pictures import BLUE, ORANGE, _exaggeration, _views, draw_matches
@@ -215,6 +216,16 @@ def test_frames_that_several_bad_edges_share_are_named() -> None:
     table = frames_table(graph, replace(found, verdict=verdict))
     assert table.rows[0][:3] == ("104", "3", "6") and len(table.rows) == 1
     assert frames_table(graph, found).rows == ()
+
+
+def test_of_edges_with_one_verdict_and_about_one_probability_the_farthest_off_is_first() -> None:
+    found = diagnose(ring(6)[0])
+    count = len(found.verdict)
+    verdict, far = np.full(count, "consistent", "<U12"), np.zeros(count)
+    verdict[9], far[3], far[5] = "wrong", 2.0, np.nan
+    probability = np.where(np.arange(count) == 7, 0.6, np.where(np.arange(count) == 3, 0.99, 0.96))
+    found = replace(found, verdict=verdict, probability=probability, residual_m=far)
+    assert ranked(found)[:4].tolist() == [9, 7, 5, 3]
 
 
 def test_a_wrong_edge_without_a_listed_cycle_says_what_is_against_it() -> None:
