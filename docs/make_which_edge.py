@@ -89,7 +89,7 @@ def main(folder: Path) -> None:
     options += ["solve_with=all", "solver.tails=gaussian", "start.revisits=null"]
     recipe = load_recipe("demo", [*options, "evaluation.tables=false"], source)
     if (run / "edges.csv").exists():
-        write_history(run, History())
+        write_history(run / "edits.json", History())
     doubled = hodge_pipeline.run(recipe, run).result.world_from_cam
 
     found = diagnose_subject(open_subject(run))
@@ -104,7 +104,7 @@ def main(folder: Path) -> None:
 
     names, graph = found.subject.graph.vertex_ids, found.subject.graph
     wrong = [names[graph.edges[row]] for row in found.rows if found.diagnosis.verdict[row] == WRONG]
-    write_history(run, History((Edit(disable=tuple(f"{i}-{j}" for i, j in wrong)),)))
+    write_history(run / "edits.json", History((Edit(disable=tuple(f"{i}-{j}" for i, j in wrong)),)))
     single = solve_again(run).result.world_from_cam
     stand = from_above(PICTURES / "which-edge-single.jpg", run, single, None)
     from_above(PICTURES / "which-edge-doubled.jpg", run, doubled, stand)

@@ -10,8 +10,7 @@ from pathlib import Path
 
 from hodge_pipeline.complex.parts import decompose, one_form
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.evaluation.evaluate import score_rounds
-from hodge_pipeline.evaluation.scores import ScoreTable
+from hodge_pipeline.evaluation.scores import ScoreTable, score_rounds
 from hodge_pipeline.executors.dask import open_workers
 from hodge_pipeline.fusion.fuse import fuse_all
 from hodge_pipeline.recipe.schema import Recipe

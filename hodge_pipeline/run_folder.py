@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from hodge_pipeline.errors import HodgeError, WorkspaceError
-from hodge_pipeline.evaluation.evaluate import evaluate
-from hodge_pipeline.evaluation.scores import ScoreTable
+from hodge_pipeline.evaluation.scores import ScoreTable, evaluate
 from hodge_pipeline.fusion.fuse import fuse
 from hodge_pipeline.recipe.scale import scale_of_scans, scaled_recipe
 from hodge_pipeline.recipe.schema import Recipe, recipe_of_run

@@ -240,6 +240,11 @@ def transform(b_from_a: Floats, points_in_a: Floats) -> Floats:
     return np.asarray(rotated + b_from_a[..., None, :3, 3])
 
 
+def by_twist(points: Floats) -> Floats:
+    """The derivative [−p^ I] (..., 3, 6) of points `exp(ξ) p` (..., 3) by ξ at 0."""
+    return np.concatenate([-hat(points), np.broadcast_to(np.eye(3), (*points.shape, 3))], axis=-1)
+
+
 def from_quat_xyzw(translation: Floats, quat_xyzw: Floats) -> Floats:
     """Motions (..., 4, 4); quaternions (..., 4) of any length but zero are normalised."""
     quat = np.asarray(quat_xyzw, float)

@@ -18,6 +18,7 @@ from hodge_adapters.pose_graphs.g2o import write_g2o
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
+from hodge_pipeline.complex import holes
 from hodge_pipeline.complex.cech import flag_complex
 from hodge_pipeline.complex.cycles import loop_products
 from hodge_pipeline.complex.holes import unfilled_loops
@@ -27,6 +28,7 @@ from hodge_pipeline.pairs.edits import Listed, pairs_to_register
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.refine.pose_graph import disabled_edges
 from hodge_pipeline.report import raster
+from hodge_pipeline.report.advice import ranked
 from hodge_pipeline.report.diagnosis_page import PageContents, edge_table, frames_table
 from hodge_pipeline.report.diagnosis_plots import pieces_apart
 from hodge_pipeline.report.edge_pictures import BLUE, ORANGE, _exaggeration, _views, draw_matches
@@ -216,6 +218,16 @@ def test_frames_that_several_bad_edges_share_are_named() -> None:
     assert frames_table(graph, found).rows == ()
 
 
+def test_of_edges_with_one_verdict_and_about_one_probability_the_farthest_off_is_first() -> None:
+    found = diagnose(ring(6)[0])
+    count = len(found.verdict)
+    verdict, far = np.full(count, "consistent", "<U12"), np.zeros(count)
+    verdict[9], far[3], far[5] = "wrong", 2.0, np.nan
+    probability = np.where(np.arange(count) == 7, 0.6, np.where(np.arange(count) == 3, 0.99, 0.96))
+    found = replace(found, verdict=verdict, probability=probability, residual_m=far)
+    assert ranked(found)[:4].tolist() == [9, 7, 5, 3]
+
+
 def test_a_wrong_edge_without_a_listed_cycle_says_what_is_against_it() -> None:
     graph = drive(loops=60, wrong=0.4).graph
     found = diagnose(graph)
@@ -299,22 +311,23 @@ def test_there_is_a_loop_for_each_hole(seed: int) -> None:
     rng = np.random.default_rng(seed)
     edges = rng.integers(0, 14, (40, 2))
     edges = edges[edges[:, 0] != edges[:, 1]]
-    holes = unfilled_loops(edges, 14)
-    loops = holes.loops
-    assert holes.count == len(loops) == betti_numbers(flag_complex(edges, 14))[1]
+    found = unfilled_loops(edges, 14)
+    loops = found.loops
+    assert found.count == len(loops) == betti_numbers(flag_complex(edges, 14))[1]
     longest = unfilled_loops(edges, 14, most_loops=2)
-    assert longest.count == holes.count
+    assert longest.count == found.count
     np.testing.assert_array_equal(longest.loops.lengths, loops.lengths[-2:])
     poses = se3.exp(rng.normal(size=(14, 6)))
     closed = loop_products(loops, se3.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]])
     np.testing.assert_allclose(closed, np.broadcast_to(np.eye(4), closed.shape), atol=1e-9)
 
 
-def test_a_graph_of_too_many_triangles_is_refused() -> None:
+def test_a_graph_of_too_many_triangles_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     edges = np.array([(i, j) for j in range(9) for i in range(j)])
     assert unfilled_loops(edges, 9).count == 0
+    monkeypatch.setattr(holes, "MOST_TRIANGLES", 10)
     with pytest.raises(GraphError, match="at most 10 triangles"):
-        unfilled_loops(edges, 9, most_triangles=10)
+        unfilled_loops(edges, 9)
 
 
 @pytest.mark.draws

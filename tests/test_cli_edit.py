@@ -56,14 +56,14 @@ def statuses(folder: Path) -> dict[str, str]:
 def test_edits_with_guesses_and_right_pairs_are_read_back(tmp_path: Path) -> None:
     guess = tuple(se3.exp(np.array([0.1, 0, 0, 1.0, 2, 3])).reshape(-1).tolist())
     history = History((Edit(register=("1-9",), right=("2-3",), guesses=(("1-9", guess),)),))
-    write_history(tmp_path, history)
-    assert read_history(tmp_path) == history
+    write_history(tmp_path / "edits.json", history)
+    assert read_history(tmp_path / "edits.json") == history
     assert history.switches == {"1-9": "registered", "2-3": "right"} and history.right == history.enabled == ("2-3",)
     assert np.array_equal(history.guesses["1-9"], np.reshape(guess, (4, 4)))
     for bad in (guess[:15], (9.0, *guess[1:])):
-        write_history(tmp_path, History((Edit(register=("1-9",), guesses=(("1-9", bad),)),)))
+        write_history(tmp_path / "edits.json", History((Edit(register=("1-9",), guesses=(("1-9", bad),)),)))
         with pytest.raises(WorkspaceError, match="is not a history of edits"):
-            read_history(tmp_path)
+            read_history(tmp_path / "edits.json")
 
 
 def test_a_guess_by_hand_goes_before_that_of_the_poses() -> None:
@@ -89,16 +89,16 @@ def test_the_latest_edit_of_a_pair_counts_and_undo_takes_it_back() -> None:
 
 def test_the_history_survives_its_file(tmp_path: Path) -> None:
     history = History((Edit(("a-b", "c-d")), Edit(enable=("a-b",), undone=True)))
-    write_history(tmp_path, history)
-    assert read_history(tmp_path) == history
-    assert read_history(tmp_path / "elsewhere") == History()
+    write_history(tmp_path / "edits.json", history)
+    assert read_history(tmp_path / "edits.json") == history
+    assert read_history(tmp_path / "elsewhere" / "edits.json") == History()
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"edits": 3}', '{"edits": [{"disable": "1-2"}]}', '{"edits": [["1-2"]]}'])
 def test_a_damaged_history_is_one_line(tmp_path: Path, text: str) -> None:
     (tmp_path / "edits.json").write_text(text)
     with pytest.raises(WorkspaceError, match=r"edits.json: is not a history of edits"):
-        read_history(tmp_path)
+        read_history(tmp_path / "edits.json")
 
 
 def test_an_edge_is_taken_out_the_run_resumes_with_it_and_undo_gives_the_old_poses(run: Run) -> None:

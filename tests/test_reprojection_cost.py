@@ -182,7 +182,7 @@ def test_blocks_of_many_bodies_are_those_of_their_joint_normal_matrix(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (model,) = ColmapModels(database="none", images="none").open_models(noisy(tmp_path))
-    poses = np.array([image.world_from_cam for image in model.records.images])
+    poses = model.records.world_from_cam
     count = len(poses)
     each = np.arange(count)
     alone = np.tile(np.eye(4), (count, 1, 1))

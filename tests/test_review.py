@@ -14,8 +14,11 @@ from diagnosis_graphs import measured, near_pairs, poses_on_a_ring
 from hodge_adapters.pose_graphs.g2o import write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.pairs.edits import Edit, History, pair_names, write_history_file
+from hodge_pipeline.pairs.edits import Edit, History, pair_names, write_history
 from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.report.diagnosis_page import EdgePictures
+from hodge_pipeline.report.document import Picture
+from hodge_pipeline.review import routes
 from hodge_pipeline.review import session as review_session
 from hodge_pipeline.review.adding import Candidate, guess_from_points
 from hodge_pipeline.review.listing import Query, describe, list_edges
@@ -201,7 +204,7 @@ def test_what_was_added_before_and_what_a_page_adds_meanwhile_are_registered_onc
     recipe, clouds = load_recipe("demo", [], tmp_path), CloudSet.from_clouds([])
     run = replace(session.subject, path=tmp_path, recipe=recipe, clouds=clouds)
     before = Edit(register=("0-12",), guesses=(("0-12", tuple(motion.reshape(-1).tolist())),))
-    write_history_file(run.edits, History((before,)))
+    write_history(run.edits, History((before,)))
     monkeypatch.setattr(review_session, "open_for_review", lambda _: run)
     for jobs in (session.slow, session.quick):  # as while a run is fused
         jobs.put("fusing", lambda: gate.wait() and None)
@@ -214,3 +217,21 @@ def test_what_was_added_before_and_what_a_page_adds_meanwhile_are_registered_onc
     session.wait()
     assert asked == [(0, 12), (2, 14)]
     assert [len(session.rows_of(pair)) for pair in ("0-12", "1-13")] == [1, 1]
+
+
+def test_pictures_of_an_edge_are_made_anew_when_a_check_betters_poses_of_the_same_revision(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[float] = []
+
+    def drawn(graph: Any, diagnosis: Any, rows: Any, *_: Any, **__: Any) -> tuple[EdgePictures, ...]:
+        made.append(float(diagnosis.world_from_cam[1, 0, 3]))
+        return (EdgePictures(int(rows[0]), (Picture("a", "b", b""),)),)
+
+    monkeypatch.setattr(routes, "edge_pictures", drawn)
+    pictures = routes.PictureCache(session)
+    assert pictures.of(3) is pictures.of(3) and len(made) == 1
+    poses = session.settled.world_from_cam.copy()
+    poses[1, 0, 3] += 1
+    session.settled = replace(session.settled, world_from_cam=poses)
+    assert pictures.of(3) and made[1] == made[0] + 1

@@ -141,7 +141,7 @@ def test_three_wrong_edges_taken_out_by_mouse_and_the_run_solved(
     page.find("#note").send_keys("one desk taken for the other")
     page.decided(lambda: page.click("#disable"))
     assert session.settled.error_m == pytest.approx(mended_m, rel=0.05)
-    assert set(read_history(run_folder).disabled) == PLANTED
+    assert set(read_history(run_folder / "edits.json").disabled) == PLANTED
     assert session.decisions.lines()[-1]["note"] == "one desk taken for the other"
 
     page.click("#finish")
@@ -158,7 +158,7 @@ def test_the_same_by_keyboard(browser: Any, review: Review, run_folder: Path) ->
         page.decided(lambda: page.press("d"))
     page.decided(lambda: page.press("u"))
     page.decided(lambda: page.press("y"))
-    assert set(read_history(run_folder).disabled) == PLANTED
+    assert set(read_history(run_folder / "edits.json").disabled) == PLANTED
     assert review.session.settled.error_m is not None and review.session.settled.error_m < 0.05
     page.press("2")
     page.until(lambda: review.session.look.mode == "edge")
@@ -210,7 +210,7 @@ def test_an_edge_added_by_three_clicked_points(browser: Any, review: Review, run
     assert np.abs(off).max() < 0.05, off
     page.decided(lambda: page.click("#accept"))
     assert session.settled.weights[session.rows_of(f"{i}-{j}")[0]] == 1
-    assert read_history(run_folder).registered == (f"{i}-{j}",)
+    assert read_history(run_folder / "edits.json").registered == (f"{i}-{j}",)
 
 
 def test_a_first_guess_by_the_handles_of_the_second_cloud(browser: Any, review: Review) -> None:
@@ -325,7 +325,7 @@ def test_two_tabs_and_a_stale_decision(bare: Any, review: Review, run_folder: Pa
     bare.switch_to.window(first)
     page.click("#disable")
     page.until(lambda: "another page has decided" in page.text("message"))
-    assert read_history(run_folder).disabled == (fresh,)
+    assert read_history(run_folder / "edits.json").disabled == (fresh,)
 
 
 def test_a_server_that_is_killed_loses_no_decision(bare: Any, run_folder: Path) -> None:
@@ -349,7 +349,7 @@ def test_a_server_that_is_killed_loses_no_decision(bare: Any, run_folder: Path) 
         finally:
             process.send_signal(signal.SIGKILL)
             process.wait()
-    assert read_history(run_folder).disabled == (name,)
+    assert read_history(run_folder / "edits.json").disabled == (name,)
 
 
 def test_without_webgl_there_is_a_line_and_every_decision(bare: Any, review: Review, run_folder: Path) -> None:
@@ -360,7 +360,7 @@ def test_without_webgl_there_is_a_line_and_every_decision(bare: Any, review: Rev
     page.choose(sorted(PLANTED)[0])
     page.press("d")
     page.until(lambda: page.data("revision") == "1")
-    assert read_history(run_folder).disabled == (sorted(PLANTED)[0],)
+    assert read_history(run_folder / "edits.json").disabled == (sorted(PLANTED)[0],)
 
 
 def test_another_origin_gets_no_socket(browser: Any, review: Review) -> None:

@@ -10,11 +10,11 @@ from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.trajectory import align
-from hodge_pipeline.pairs.edits import read_history_file
+from hodge_pipeline.pairs.edits import read_history
 from hodge_pipeline.review.keeping import save
 from hodge_pipeline.review.listing import Query, describe, list_edges, state
 from hodge_pipeline.review.opening import Review
-from hodge_pipeline.review.routes import EdgePictures
+from hodge_pipeline.review.routes import PictureCache
 from hodge_pipeline.review.subject import open_for_review
 from hodge_pipeline.types import Floats
 from test_readers_colmap_rigs import write_model
@@ -71,16 +71,14 @@ def test_decisions_are_kept_and_the_adjusted_model_is_written_beside_it(tmp_path
         session.wait()
         assert (session.settled.weights[session.rows_of(pair)] == 0).all()
         said = [str(list_edges(session, Query())), str(describe(session, 5))]
-        said += [one.caption for one in EdgePictures(session).of(5)]
+        said += [one.caption for one in PictureCache(session).of(5)]
         assert "units" in said[0] and not [text for text in said if re.search(r"\d [cm]?m\b", text)]
         assert state(session)["finish"] == "adjust and save as COLMAP model" and describe(session, 3)["name"] == pair
         path, told = save(session)
         assert save(session)[0] == tmp_path / "model.reviewed-2"
     assert path == tmp_path / "model.reviewed" and "mean reprojection error" in told and "worse" not in told
     assert {name: (folder / name).read_bytes() for name in before} == before
-    assert (
-        read_history_file(folder / "edits.json").disabled == read_history_file(path / "edits.json").disabled == (pair,)
-    )
+    assert read_history(folder / "edits.json").disabled == read_history(path / "edits.json").disabled == (pair,)
     truth, found = centres(right), centres(path / "sparse/0")
     assert found.keys() == truth.keys()
     poses = [np.tile(np.eye(4), (len(truth), 1, 1)) for _ in range(2)]

@@ -9,7 +9,7 @@ import pytest
 
 import review_data
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.pairs.edits import Edit, History, read_history_file, write_history_file
+from hodge_pipeline.pairs.edits import Edit, History, read_history, write_history
 from hodge_pipeline.review.decisions import LockedError, StaleError
 from hodge_pipeline.review.keeping import save
 from hodge_pipeline.review.listing import state
@@ -38,17 +38,17 @@ def test_a_stale_revision_changes_nothing(session: Session) -> None:
     kept = session.decisions.history
     with pytest.raises(StaleError, match="another page has decided"):
         session.decide(seen, "disable", [2])
-    assert session.decisions.history == read_history_file(session.subject.edits) == kept
+    assert session.decisions.history == read_history(session.subject.edits) == kept
 
 
 def test_edits_of_another_program_are_taken_over_not_written_over(session: Session) -> None:
     other = History((Edit(disable=("0-1",)),))
-    write_history_file(session.subject.edits, other)
+    write_history(session.subject.edits, other)
     with pytest.raises(StaleError, match="another program"):
         session.decide(revision(session), "disable", [1])
-    assert read_history_file(session.subject.edits) == other == session.decisions.history
+    assert read_history(session.subject.edits) == other == session.decisions.history
     session.undo(revision(session))
-    assert read_history_file(session.subject.edits).switches == {}
+    assert read_history(session.subject.edits).switches == {}
 
 
 def test_redo_restores_what_was_undone_last_and_is_gone_after_a_new_decision(session: Session) -> None:
@@ -77,7 +77,7 @@ def test_a_graph_is_saved_beside_the_old_one_and_nothing_is_written_over(session
     (first, _), (second, _) = save(session), save(session)
     assert [first.name, second.name] == ["ring.reviewed.g2o", "ring.reviewed-2.g2o"]
     assert session.subject.path.read_bytes() == before
-    assert read_history_file(first.with_name(first.name + ".edits.json")) == session.decisions.history
+    assert read_history(first.with_name(first.name + ".edits.json")) == session.decisions.history
     saved = open_for_review(first)
     assert saved.graph.edge_count == len(session.table) - len(PLANTED)
     assert np.allclose(saved.source.trajectory.world_from_cam, session.settled.world_from_cam, atol=1e-6)  # type: ignore[union-attr]

@@ -8,7 +8,7 @@ import pytest
 import hodge_pipeline
 from hodge_pipeline import registry
 from hodge_pipeline.errors import HodgeError, WorkspaceError
-from hodge_pipeline.pairs.edits import read_history_file
+from hodge_pipeline.pairs.edits import read_history
 from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.review.decisions import LockedError
 from hodge_pipeline.review.keeping import save
@@ -59,7 +59,7 @@ def test_graphs_of_other_formats_are_decided_about_beside_them(
             session.settled.weights[PLANTED[0]] == 0 and (session.settled.weights > 0).sum() == len(session.table) - 1
         )
         saved, _ = save(session)
-    assert read_history_file(tmp_path / f"{name}.edits.json").disabled == (pair,)
+    assert read_history(tmp_path / f"{name}.edits.json").disabled == (pair,)
     assert (tmp_path / f"{name}.decisions.csv").exists() and saved.name == "ring.reviewed.g2o"
     assert path.read_bytes() == before
     with Review(path, scene=False) as again:

@@ -66,6 +66,14 @@ def test_adjoint_moves_a_twist_to_the_left(xi: np.ndarray) -> None:
 
 @settings(deadline=None)
 @given(twists())
+def test_points_move_by_a_twist_as_its_derivative_says(xi: np.ndarray) -> None:
+    points, small = np.array([[1.0, -2.0, 3.0], [0.0, 0.5, -4.0]]), 1e-6 * xi / np.abs(xi).max(initial=1.0)
+    moved = se3.transform(se3.exp(small), points) - points
+    np.testing.assert_allclose(moved, np.einsum("pij,...j->...pi", se3.by_twist(points), small), atol=1e-10)
+
+
+@settings(deadline=None)
+@given(twists())
 def test_information_pulled_back_weighs_a_motion_as_on_the_other_side(xi: np.ndarray) -> None:
     motion, small = se3.exp(xi), np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.6]) / 10
     left = se3.log(motion @ se3.exp(small) @ se3.inverse(motion))

@@ -150,7 +150,7 @@ def test_after_an_edit_key_frames_alone_are_fused_and_it_is_said(
 ) -> None:
     folder, keys = Path(shutil.copytree(run.folder, tmp_path / "run")), len(run.result.world_from_cam)
     i, j = run.result.graph.vertex_ids[run.result.graph.edges[0]]
-    write_history(folder, History((Edit(disable=(f"{i}-{j}",)),)))
+    write_history(folder / "edits.json", History((Edit(disable=(f"{i}-{j}",)),)))
     edited = solve_again(folder)
     assert any(f"the {keys} key frames alone" in str(note) for note in edited.report.notes)
     again = hodge_pipeline.run(small_recipe(sequence, FUSED), folder)

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any, get_args
 
 from hodge_pipeline.cli.console import ProgressBars, print_json
-from hodge_pipeline.cli.convert import writer_name
+from hodge_pipeline.cli.convert import check_result, keep_source, writer_name
 from hodge_pipeline.cli.options import Shown
-from hodge_pipeline.cli.paths import check_result, keep_source
 from hodge_pipeline.errors import CheckError, RecipeError
-from hodge_pipeline.pairs.edits import read_history
+from hodge_pipeline.pairs.edits import FILE, read_history
 from hodge_pipeline.refine.pose_graph import SolvedFile, SolveOptions, solve_file, write_solved
 from hodge_pipeline.report.brief import LABEL, at_most, labelled
 from hodge_pipeline.solvers.backbone.trust import AUTO
@@ -79,7 +78,7 @@ def solve(
     if out is None and run_folder is None and options == SolveOptions() and (path / RECIPE_FILE).is_file():
         _solve_run(path, shown, dask)
         return
-    if path.is_dir() and (history := read_history(path)).edits:
+    if path.is_dir() and (history := read_history(path / FILE)).edits:
         options = replace(options, disable=(*options.disable, *history.disabled))
         if out is None and not (path / RECIPE_FILE).is_file():
             run_folder = run_folder or path

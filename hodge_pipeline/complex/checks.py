@@ -47,8 +47,8 @@ def refuse_priors(graph: ViewGraph, solver: str) -> None:
     if graph.priors is not None and len(graph.priors.vertices):
         count = len(graph.priors.vertices)
         raise GraphError(
-            f"{solver} has no term for priors of single poses ({count} given): take solver maximum_likelihood, robust "
-            "or diagnosed, or leave them out (priors=None)"
+            f"{solver} has no term for priors of single poses ({count} given): take solver maximum_likelihood or "
+            "robust, or leave them out (priors=None)"
         )
 
 

@@ -68,13 +68,8 @@ def student_weight(chi2: Floats, axes: int, *, usual: Floats, registered: bool =
 def squares_at_both_ends(i_from_j: Floats, xi: Floats) -> tuple[Floats, Floats]:
     """Squared residuals (E,) of twists (E, 6): rotation, rad², and translation, m², the mean of both ends."""
     turn, here = xi[:, :3], xi[:, 3:]
-    there = here + np.cross(turn, _i_origin_in_j(i_from_j))
+    there = here + np.cross(turn, se3.inverse(i_from_j)[:, :3, 3])  # at frame i's origin
     return (turn**2).sum(axis=1), ((here**2).sum(axis=1) + (there**2).sum(axis=1)) / 2
-
-
-def _i_origin_in_j(i_from_j: Floats) -> Floats:
-    """Frame i's origin (E, 3) in frame j: residuals of translation at i are taken there."""
-    return np.asarray(-np.einsum("eji,ej->ei", i_from_j[:, :3, :3], i_from_j[:, :3, 3]))
 
 
 def in_vertex_order(graph: ViewGraph) -> tuple[ViewGraph, Bools]:

@@ -45,7 +45,10 @@ def describe_components(component: Ints, vertex_ids: NDArray[np.generic]) -> tup
     if len(sizes) <= 1:
         return ()
     several = np.flatnonzero(sizes > 1)
-    pieces = [_describe_piece(int(p), vertex_ids[component == p]) for p in several[:MOST_PIECES_LISTED]]
+    named = [(int(piece), vertex_ids[component == piece]) for piece in several[:MOST_PIECES_LISTED]]
+    pieces = [
+        f"piece {piece}: {counted(len(names), 'vertex|vertices')} ({names[0]} … {names[-1]})" for piece, names in named
+    ]
     if len(several) > MOST_PIECES_LISTED:
         pieces.append(f"{len(several) - MOST_PIECES_LISTED} smaller pieces")
     single = vertex_ids[np.isin(component, np.flatnonzero(sizes == 1))]
@@ -55,10 +58,6 @@ def describe_components(component: Ints, vertex_ids: NDArray[np.generic]) -> tup
         pieces.append(f"{len(single)} without any edge ({shown}{rest})")
     text = "; ".join(pieces)
     return (f"graph falls into {len(sizes)} pieces, each with its own gauge: {text}",)
-
-
-def _describe_piece(number: int, names: NDArray[np.generic]) -> str:
-    return f"piece {number}: {counted(len(names), 'vertex|vertices')} ({names[0]} … {names[-1]})"
 
 
 def in_runs(rows: Ints, vertex_ids: Ints | np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> str:

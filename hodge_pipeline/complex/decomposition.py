@@ -20,12 +20,8 @@ RELATIVE_RESIDUAL, ENOUGH = 1e-13, 1e-9
 
 @dataclass(frozen=True)
 class HodgeDecomposition:
-    """`ω = exact + coexact + harmonic`, each (E, k), orthogonal in the inner product of `weights (E,)`.
+    """`ω = exact + coexact + harmonic`, each (E, k), orthogonal in the inner product of `weights (E,)`."""
 
-    `potential (V, k)` is f with `exact = d0 f`, 0 at the first vertex of each component.
-    """
-
-    potential: Floats
     exact: Floats
     coexact: Floats
     harmonic: Floats
@@ -55,12 +51,11 @@ def hodge_decomposition(d0: csr_matrix, d1: csr_matrix, omega: Floats, weights: 
         bad = int((~(np.isfinite(weights) & (weights > 0))).sum())
         raise GraphError(f"the Hodge decomposition needs positive weights: {bad} of {len(weights)} are not")
     omega = np.asarray(omega, float)
-    potential = gradient_fit(d0, omega, weights)
-    exact = np.asarray(d0 @ potential)
+    exact = np.asarray(d0 @ gradient_fit(d0, omega, weights))
     rest = omega - exact
     dual = csr_matrix(d1.T, dtype=float)
     coexact = np.asarray(dual @ _conjugate_gradients(dual, rest, weights)) / weights[:, None]
-    return HodgeDecomposition(potential, exact, coexact, rest - coexact, weights)
+    return HodgeDecomposition(exact, coexact, rest - coexact, weights)
 
 
 def gradient_fit(d: csr_matrix, values: Floats, weights: Floats) -> Floats:

@@ -24,19 +24,17 @@ class Holes:
     loops: Loops
 
 
-def unfilled_loops(
-    edges: Ints, vertex_count: int, most_triangles: int = MOST_TRIANGLES, most_loops: int | None = None
-) -> Holes:
+def unfilled_loops(edges: Ints, vertex_count: int, most_loops: int | None = None) -> Holes:
     """One loop for each hole, over the rows of `edges` (E, 2); parallel edges leave no hole. `most_loops`: how many
     loops to give, the longest.
 
     The loops that chords close in a breadth-first forest span all cycles. Each triangle is a relation between chords
     over GF(2); eliminating the chord of the longest loop from each leaves as many chords as there are holes, b1.
-    Raises `GraphError` above `most_triangles`.
+    Raises `GraphError` above `MOST_TRIANGLES`.
     """
     oriented = orient_edges(edges, vertex_count)
-    if clique_counts(oriented.edges, vertex_count)[2] > most_triangles:
-        raise GraphError(f"holes are sought in graphs of at most {most_triangles} triangles")
+    if clique_counts(oriented.edges, vertex_count)[2] > MOST_TRIANGLES:
+        raise GraphError(f"holes are sought in graphs of at most {MOST_TRIANGLES} triangles")
     forest = spanning_forest(oriented.edges, vertex_count)
     rank = np.full(len(oriented.edges), -1, np.int64)
     by_length = np.argsort(_lengths(forest), kind="stable")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -39,7 +39,6 @@ def solve_robust(
     start: Floats | None = None,
     diagnosis: DiagnosisOptions = DEFAULTS,
     objective: ObjectiveName = "full",
-    dimension: Literal[2, 3] | None = None,
     certificate: bool = False,
 ) -> Solution:
     """The poses of the edges that the diagnosis keeps; `weights (E,)` are from 0 to 1 for these and 0 for the others.
@@ -62,7 +61,6 @@ def solve_robust(
             start=start if len(fixed) else _placed(chosen, poses, start),
             initial="chordal" if len(fixed) or graph.priors is not None else "given",
             objective=objective,
-            dimension=dimension,
             fixed=fixed,
             certificate=certificate,
         )

@@ -6,7 +6,7 @@ its score is always printed beside the reference's own.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias, get_args
@@ -19,8 +19,9 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M, DistanceBlock, block_distances
 from hodge_pipeline.pairs.centroid import centroids_in_world
 from hodge_pipeline.pairs.overlap import pairwise_iou
-from hodge_pipeline.stages import Workers
-from hodge_pipeline.types import CloudSet, Floats, Ints, PointCloud
+from hodge_pipeline.scene import Round, has_truth, pose_sets, true_poses
+from hodge_pipeline.stages import Step, Steps, Workers
+from hodge_pipeline.types import CloudSet, Floats, Ints, PointCloud, Source
 from hodge_pipeline.types.arrays import evenly
 
 GraphKind: TypeAlias = Literal["distance", "iou"]
@@ -169,7 +170,7 @@ class ScoreTable:
 
 def score_table(
     clouds_folder: Path,
-    pose_sets: Mapping[str, Floats],
+    sets: Mapping[str, Floats],
     reference: str,
     workers: Workers,
     *,
@@ -182,16 +183,36 @@ def score_table(
     spread, are scored; pairs of both graphs are measured once. Lengths are multiplied by `scale`, for scenes that are
     no rooms. Raises `GraphError` for an unknown reference.
     """
-    if reference not in pose_sets:
-        raise GraphError(f"reference poses {reference!r} are not among {', '.join(pose_sets)}")
+    if reference not in sets:
+        raise GraphError(f"reference poses {reference!r} are not among {', '.join(sets)}")
     clouds = CloudSet.open(clouds_folder)
-    every = [evaluation_pairs(clouds, pose_sets[reference], kind, scale) for kind in kinds]
+    every = [evaluation_pairs(clouds, sets[reference], kind, scale) for kind in kinds]
     graphs = [pairs[evenly(len(pairs), MOST_PAIRS)] for pairs in every]
     union, rank = np.unique(np.concatenate(graphs), axis=0, return_inverse=True)
-    poses = np.stack(list(pose_sets.values()))
+    poses = np.stack(list(sets.values()))
     distances = edge_distances(clouds_folder, union, poses, workers, scale=scale)
     columns = np.split(rank.reshape(-1), np.cumsum([len(pairs) for pairs in graphs])[:-1])
     scored = (
         GraphScores(kind, pairs, distances[:, c], scale) for kind, pairs, c in zip(kinds, graphs, columns, strict=True)
     )
-    return ScoreTable(tuple(pose_sets), reference, tuple(scored))
+    return ScoreTable(tuple(sets), reference, tuple(scored))
+
+
+def score_rounds(
+    source: Source, clouds: CloudSet, rounds: Sequence[Round], scale: float, steps: Steps, workers: Workers
+) -> ScoreTable:
+    """The scores of every round and of the true poses where there are any, which then are the reference.
+
+    Lengths of the scores are multiplied by `scale`.
+    """
+    sets = pose_sets(rounds, source)
+    sets = {"truth": true_poses(source), **sets} if has_truth(source) else sets
+    reference = "truth" if has_truth(source) else "result"
+    return steps.step(evaluate, clouds, sets, reference, scale, title="evaluation", workers=workers)
+
+
+def evaluate(
+    clouds: CloudSet, sets: dict[str, Floats], reference: str, scale: float, *, workers: Workers, step: Step
+) -> ScoreTable:
+    """Step: the scores of named sets of poses (K, 4, 4), on the pairs that overlap under the `reference` one."""
+    return score_table(clouds.folder, sets, reference, workers, scale=scale)

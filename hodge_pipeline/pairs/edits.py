@@ -115,12 +115,7 @@ class History:
         return History((*self.edits[:row], replace(self.edits[row], undone=undone), *self.edits[row + 1 :]))
 
 
-def read_history(folder: Path) -> History:
-    """The edits of a run folder, none where there is no file. Raises `WorkspaceError` where it cannot be read."""
-    return read_history_file(folder / FILE)
-
-
-def read_history_file(path: Path) -> History:
+def read_history(path: Path) -> History:
     """The edits in a file, none where there is no file. Raises `WorkspaceError` where it cannot be read."""
     if not path.exists():
         return History()
@@ -155,12 +150,7 @@ def _guess(item: Any) -> Guess:
     return pair, tuple(map(float, numbers))
 
 
-def write_history(folder: Path, history: History) -> None:
-    """Write the edits into a run folder, atomically."""
-    write_history_file(folder / FILE, history)
-
-
-def write_history_file(path: Path, history: History) -> None:
+def write_history(path: Path, history: History) -> None:
     """Write the edits into a file, atomically."""
     artifacts.write_json(path, {"format_version": FORMAT_VERSION, "edits": [asdict(edit) for edit in history.edits]})
 

@@ -132,14 +132,11 @@ def graph_summary(outer: int, graph: ViewGraph, residual_m: Floats, rejected: Ed
         rows += [("edges of a frame, least / mean / most", spread)]
         rows += [("frames without an edge", np.count_nonzero(degree == 0))]
     if len(known):
-        rows += [("residual, median / 95th / largest", _millimetres(known))]
+        shown = " / ".join(f"{1000 * value:.1f}" for value in np.percentile(known, [50, 95, 100]))
+        rows += [("residual, median / 95th / largest", f"{shown} mm")]
     if rejected is not None:
         rows += [("candidates that became no edge", len(rejected))]
     return f"# Viewing graph, round {outer}\n\n{markdown_table(('', ''), rows)}"
-
-
-def _millimetres(residual_m: Floats) -> str:
-    return " / ".join(f"{1000 * value:.1f}" for value in np.percentile(residual_m, [50, 95, 100])) + " mm"
 
 
 def _log_film(

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from hodge_pipeline.recording.recorder import Recorder
 from hodge_pipeline.recording.run import FILE
+from hodge_pipeline.recording.stream import identity_of_poses
 from hodge_pipeline.types import Floats, Solution, ViewGraph
 
 
@@ -30,9 +28,8 @@ def record_graph(
     The sets of poses alone where nothing was solved; `is_scanner` as of a `Recorder`. What was left out, in words.
     """
     result = start if solution is None else solution.world_from_cam
-    identity = hashlib.sha256(np.ascontiguousarray(result).tobytes()).hexdigest()[:32]
     with tempfile.TemporaryDirectory(dir=folder, prefix=".recording-") as parts:
-        recorder = Recorder(Path(parts), identity, is_scanner=is_scanner)
+        recorder = Recorder(Path(parts), identity_of_poses(result), is_scanner=is_scanner)
         left_out = [*recorder.frames(name, (), tuple(notes))]
         left_out += [note for label, poses in sets.items() for note in recorder.poses(label, poses)]
         if graph is not None and solution is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import shutil
@@ -55,6 +56,11 @@ class Part:
         if len(rows) < available:
             self.note(f"{len(rows)} of {available} {what}")
         return rows
+
+
+def identity_of_poses(world_from_cam: Floats) -> str:
+    """The identity of a recording that these poses alone tell apart."""
+    return hashlib.sha256(np.ascontiguousarray(world_from_cam).tobytes()).hexdigest()[:32]
 
 
 def open_stream(recording_id: str, application: str = APPLICATION) -> rr.RecordingStream:

@@ -8,14 +8,14 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.registration.one_thread import o3d
-from hodge_pipeline.registration.open3d_cloud import Open3dCloud, register_levels
-from hodge_pipeline.types import Floats, PointCloud, Registration
+from hodge_pipeline.registration.open3d_cloud import Open3dCloud, Open3dRegistrar
+from hodge_pipeline.types import Floats, Registration
 
 o3d_registration = o3d.pipelines.registration
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class PointToPlaneIcp:
+class PointToPlaneIcp(Open3dRegistrar):
     """Point-to-plane ICP: the least that works, three times the cost of gicp."""
 
     distances_m: tuple[float, ...] = Field(
@@ -24,28 +24,10 @@ class PointToPlaneIcp:
         description="Metres, coarse to fine: how far apart corresponding points may be. 0.3 forgives a start 10 cm and "
         "5° off.",
     )
-    max_iterations: int = Field(default=30, ge=1, description="Steps at each level, at most.")
-    points_per_sample: float = Field(
-        default=100.0,
-        gt=0,
-        description="Points that count as one independent measurement in the information; as for gicp.",
-    )
-
-    def prepare(self, cloud: PointCloud) -> Open3dCloud:
-        """The cloud with normals, colours and a tree, each made when it is first needed."""
-        return Open3dCloud(cloud)
 
     def register(self, target: Open3dCloud, source: Open3dCloud, i_from_j: Floats) -> Registration:
         """Cloud j (source) moved onto cloud i (target) from the guess."""
-        return register_levels(
-            self._align,
-            self.distances_m,
-            target,
-            source,
-            i_from_j,
-            max_distance_m=min(self.distances_m),
-            points_per_sample=self.points_per_sample,
-        )
+        return self._registered(self._align, self.distances_m, (target, source), i_from_j, min(self.distances_m))
 
     def _align(self, target: Open3dCloud, source: Open3dCloud, distance_m: float, guess: Floats) -> Any:
         return o3d_registration.registration_icp(

@@ -8,12 +8,12 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.registration.one_thread import o3d
-from hodge_pipeline.registration.open3d_cloud import Open3dCloud, register_levels
-from hodge_pipeline.types import Floats, PointCloud, Registration
+from hodge_pipeline.registration.open3d_cloud import Open3dCloud, Open3dRegistrar
+from hodge_pipeline.types import Floats, Registration
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Ndt:
+class Ndt(Open3dRegistrar):
     """Cloud j against Gaussians in voxels of cloud i: no correspondences, a wide basin."""
 
     voxels_m: tuple[float, ...] = Field(
@@ -21,29 +21,13 @@ class Ndt:
         min_length=1,
         description="Metres, coarse to fine: side of a voxel. Below about 0.2 too few points of a 3 cm cloud fill one.",
     )
-    max_iterations: int = Field(default=30, ge=1, description="Steps at each level, at most.")
     assessed_within_m: float = Field(
         default=0.1, gt=0, description="metres: points of j this near to one of i count in fitness and information"
     )
-    points_per_sample: float = Field(
-        default=100.0, gt=0, description="Points that count as one independent measurement in the information."
-    )
-
-    def prepare(self, cloud: PointCloud) -> Open3dCloud:
-        """The cloud, and a tree when the result is assessed."""
-        return Open3dCloud(cloud)
 
     def register(self, target: Open3dCloud, source: Open3dCloud, i_from_j: Floats) -> Registration:
         """Cloud j (source) moved onto cloud i (target) from the guess."""
-        return register_levels(
-            self._align,
-            self.voxels_m,
-            target,
-            source,
-            i_from_j,
-            max_distance_m=self.assessed_within_m,
-            points_per_sample=self.points_per_sample,
-        )
+        return self._registered(self._align, self.voxels_m, (target, source), i_from_j, self.assessed_within_m)
 
     def _align(self, target: Open3dCloud, source: Open3dCloud, voxel_m: float, guess: Floats) -> Any:
         option = o3d.pipelines.registration.NormalDistributionsTransformOption(

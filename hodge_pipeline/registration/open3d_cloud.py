@@ -1,4 +1,4 @@
-"""A cloud as open3d wants it, assessed like every other."""
+"""A cloud as open3d wants it, and what its registrars share: assessed like every other."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
 from hodge_pipeline.registration.assessment import MIN_POINTS, to_registration, unregistered
@@ -42,29 +44,41 @@ class Open3dCloud(PreparedCloud):
         return cloud
 
 
-def register_levels(
-    align: Align,
-    levels: Sequence[float],
-    target: Open3dCloud,
-    source: Open3dCloud,
-    i_from_j: Floats,
-    *,
-    max_distance_m: float,
-    points_per_sample: float,
-) -> Registration:
-    """Cloud j (source) moved onto cloud i (target), level by level; assessed within `max_distance_m`."""
-    guess = np.asarray(i_from_j, np.float64)
-    if min(len(target), len(source)) < MIN_POINTS:
-        return unregistered(guess)
-    motion, iterations = guess, 0
-    for level in levels:
-        try:
-            result = align(target, source, level, motion)
-        except RuntimeError:  # open3d found no correspondence, or no voxel with enough points
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Open3dRegistrar:
+    """Options of all of open3d's registrars, and the registration level by level."""
+
+    max_iterations: int = Field(default=30, ge=1, description="Steps at each level, at most.")
+    points_per_sample: float = Field(
+        default=100.0,
+        gt=0,
+        description="Points that count as one independent measurement in the information; as for gicp.",
+    )
+
+    def prepare(self, cloud: PointCloud) -> Open3dCloud:
+        """The cloud with normals, colours and a tree, each made when it is first needed."""
+        return Open3dCloud(cloud)
+
+    def _registered(
+        self,
+        align: Align,
+        levels: Sequence[float],
+        pair: tuple[Open3dCloud, Open3dCloud],
+        i_from_j: Floats,
+        within_m: float,
+    ) -> Registration:
+        """Cloud j, the second of the pair, moved onto cloud i, level by level; assessed within `within_m`."""
+        guess, (target, source) = np.asarray(i_from_j, np.float64), pair
+        if min(len(target), len(source)) < MIN_POINTS:
             return unregistered(guess)
-        if not se3.is_motion(result.transformation):
-            return unregistered(guess)
-        motion = se3.from_parts(se3.project_to_so3(result.transformation[:3, :3]), result.transformation[:3, 3])
-        iterations += 1
-    assessment = target.assess(source.points, motion, max_distance_m, points_per_sample)
-    return to_registration(assessment, motion, iterations, converged=True)
+        motion = guess
+        for level in levels:
+            try:
+                result = align(target, source, level, motion)
+            except RuntimeError:  # open3d found no correspondence, or no voxel with enough points
+                return unregistered(guess)
+            if not se3.is_motion(result.transformation):
+                return unregistered(guess)
+            motion = se3.from_parts(se3.project_to_so3(result.transformation[:3, :3]), result.transformation[:3, 3])
+        assessment = target.assess(source.points, motion, within_m, self.points_per_sample)
+        return to_registration(assessment, motion, len(levels), converged=True)

@@ -199,7 +199,8 @@ def guided_match(target: WithLandmarks, source: WithLandmarks, i_from_j: Floats,
     if not len(target.landmarks) or not len(source.landmarks):
         return np.zeros((0, 2), np.int64)
     moved = se3.transform(i_from_j, source.landmarks)
-    squared = _squared_distances(target.landmarks, moved)
+    squares = [(points**2).sum(axis=1) for points in (target.landmarks, moved)]
+    squared = squares[0][:, None] + squares[1] - 2.0 * target.landmarks @ moved.T
     unlike = np.where(squared < within_m**2, 2.0 - 2.0 * (target.descriptors @ source.descriptors.T), FAR)
     of_source = unlike.argmin(axis=0)
     columns = np.arange(len(of_source))
@@ -209,7 +210,3 @@ def guided_match(target: WithLandmarks, source: WithLandmarks, i_from_j: Floats,
     stands_out = nearest < GUIDED_RATIO**2 * unlike.min(axis=0)
     kept = np.flatnonzero(mutual & stands_out)
     return np.stack([of_source[kept], kept], axis=1).astype(np.int64)
-
-
-def _squared_distances(a: Floats, b: Floats) -> Floats:
-    return np.asarray((a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2.0 * a @ b.T)

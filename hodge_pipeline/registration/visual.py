@@ -150,7 +150,7 @@ def _steps(points_j: Floats, weight: Floats) -> Callable[[Floats, Bools], tuple[
     """From residuals (n, 3) and those that count (n,) to the Gauss-Newton step ξ (6,) and the information (6, 6), with
     Cauchy weights; `weight (n, 3, 3)` are the inverse covariances of the residuals, in j's axes.
     """
-    jacobian = np.concatenate([-se3.hat(points_j), np.broadcast_to(np.eye(3), weight.shape)], axis=2)
+    jacobian = se3.by_twist(points_j)
     weighted = weight @ jacobian
     each = (np.swapaxes(jacobian, 1, 2) @ weighted).reshape(-1, 36)
     flat = weighted.reshape(-1, 6)

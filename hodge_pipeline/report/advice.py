@@ -15,7 +15,9 @@ SPLITS = 1 - 1e-6
 
 
 def ranked(diagnosis: Diagnosis) -> Ints:
-    """Rows of all edges, the worst first: wrong, suspect, untestable, consistent; in each the least probable."""
+    """Rows of all edges, the worst first: wrong, suspect, untestable, consistent; in each the least probable, and of
+    those as probable to a tenth the farthest from the poses, those that join two pieces before them.
+    """
     place = np.argmax(diagnosis.verdict[:, None] == np.array(WORST_FIRST), axis=1)
     probability = np.nan_to_num(diagnosis.probability, nan=0.5)
     return np.lexsort((-np.nan_to_num(diagnosis.residual_m, nan=np.inf), probability.round(1), place))

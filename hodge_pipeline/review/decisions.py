@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hodge_pipeline.errors import GraphError, HodgeError, WorkspaceError, not_written
-from hodge_pipeline.pairs.edits import VERBS, Edit, History, read_history_file, write_history_file
+from hodge_pipeline.pairs.edits import VERBS, Edit, History, read_history, write_history
 from hodge_pipeline.store.workspace import holding
 from hodge_pipeline.types.input_files import read_input_text
 from hodge_pipeline.types.text import cell, csv_text
@@ -48,7 +48,7 @@ class Decisions:
 
     def __init__(self, file: Path, log: Path, *, run_folder: Path | None, locked: str = "") -> None:
         self._file, self._log, self._run_folder, self._locked = file, log, run_folder, locked
-        self.history = read_history_file(file)
+        self.history = read_history(file)
         self.revision = 0
         self._undone: list[int] = []
 
@@ -67,7 +67,7 @@ class Decisions:
 
     def refresh(self) -> bool:
         """Read the file again, and tell whether another program has changed it."""
-        found = read_history_file(self._file)
+        found = read_history(self._file)
         if found == self.history:
             return False
         self.history, self._undone = found, []
@@ -123,7 +123,7 @@ class Decisions:
 
     def _put(self, history: History, prefix: str, edit: Edit, entry: LogEntry) -> None:
         try:
-            write_history_file(self._file, history)
+            write_history(self._file, history)
         except OSError as error:
             raise not_written(self._file, error) from error
         self.history = history

@@ -9,7 +9,7 @@ import numpy as np
 
 from hodge_pipeline import registry
 from hodge_pipeline.errors import not_written
-from hodge_pipeline.pairs.edits import FILE, write_history_file
+from hodge_pipeline.pairs.edits import FILE, write_history
 from hodge_pipeline.refine.reprojection_cost import SAME_COST, costs
 from hodge_pipeline.review.session import Session
 from hodge_pipeline.review.subject import SIDE_FILE, Subject
@@ -35,11 +35,11 @@ def save(session: Session) -> tuple[Path, str]:
     try:
         if subject.model is not None:
             told = _write_model(path, subject.model, settled.world_from_cam)
-            write_history_file(path / FILE, history)
+            write_history(path / FILE, history)
         else:
             chosen = table.graph.select(np.flatnonzero(settled.weights > 0))
             told = _write_graph(path, subject, chosen, settled.world_from_cam)
-            write_history_file(path.with_name(path.name + SIDE_FILE), history)
+            write_history(path.with_name(path.name + SIDE_FILE), history)
     except OSError as error:
         raise not_written(path, error) from error
     return path, told

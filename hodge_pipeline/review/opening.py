@@ -10,7 +10,6 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from hodge_pipeline.errors import WorkspaceError
@@ -62,9 +61,7 @@ class Review:
     def __enter__(self) -> Review:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

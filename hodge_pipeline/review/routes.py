@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
@@ -75,7 +74,7 @@ def _then_state(session: Session, action: Callable[[Asked], None]) -> Route:
 
 def _views(session: Session) -> Mapping[str, Route]:
     """What a page can ask for, by GET."""
-    pictures = EdgePictures(session)
+    pictures = PictureCache(session)
 
     def edge(asked: Asked) -> Answer:
         row = _whole(asked, "row")
@@ -243,12 +242,12 @@ def _frames(session: Session, asked: Asked) -> list[int]:
     return [rows[str(name)] for name in names]
 
 
-class EdgePictures:
+class PictureCache:
     """The pictures of edges at the present poses, made when they are first asked for; the last few are kept."""
 
     def __init__(self, session: Session) -> None:
-        self._session = session
-        self._made: OrderedDict[tuple[int, int, int], tuple[Picture, ...]] = OrderedDict()
+        self._session, self._settled = session, session.settled
+        self._made: dict[int, tuple[Picture, ...]] = {}
         self._lock = Lock()
 
     def of(self, row: int) -> tuple[Picture, ...]:
@@ -260,9 +259,10 @@ class EdgePictures:
         table.check_row(row)
         if judged is None:
             return ()
-        key = id(subject), settled.revision, row
         with self._lock:
-            if key not in self._made:
+            if settled is not self._settled:
+                self._settled, self._made = settled, {}
+            if row not in self._made:
                 poses = replace(judged.diagnosis, world_from_cam=settled.world_from_cam, piece=settled.component)
                 found = edge_pictures(
                     table.graph, poses, np.array([row]), subject.frames, subject.clouds, has_metres=subject.unit == "m"
@@ -273,7 +273,7 @@ class EdgePictures:
                     for one in found
                     for plot in one.plots
                 )
-                self._made[key] = tuple(replace(plot, title=title) for plot, title in titled)
-                while len(self._made) > PICTURES_KEPT:
-                    self._made.popitem(last=False)
-            return self._made[key]
+                self._made[row] = tuple(replace(plot, title=title) for plot, title in titled)
+                if len(self._made) > PICTURES_KEPT:
+                    del self._made[next(iter(self._made))]
+            return self._made[row]

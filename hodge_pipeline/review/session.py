@@ -27,13 +27,8 @@ from hodge_pipeline.review.subject import Subject, open_for_review
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
 from hodge_pipeline.types.edges import DISABLED
 
-_EDITS: dict[str, Callable[[tuple[str, ...]], Edit]] = {
-    "disable": lambda pairs: Edit(disable=pairs),
-    "enable": lambda pairs: Edit(enable=pairs),
-    "right": lambda pairs: Edit(right=pairs),
-}
 _SWITCHES = {"disable": DISABLED, "enable": ENABLED, "right": RIGHT}
-VERBS = tuple(_EDITS)
+"""What each decision on an edge makes of it."""
 CANDIDATE_MODES = ("apart", "place")
 MODES = ("all", "edge", "solution", "blink", "between", *CANDIDATE_MODES)
 """How the scene shows edges; see `Look`."""
@@ -131,13 +126,14 @@ class Session:
     def decide(self, revision: int, verb: str, rows: Sequence[int], note: str = "") -> None:
         """Disable edges, enable them or mark them right, and solve. Raises as `Decisions.add`, and `GraphError`."""
         count = len(self.table)
-        if verb not in VERBS or not rows or not all(0 <= row < count for row in rows):
-            raise GraphError(f"{verb}: expected {', '.join(VERBS)} and rows of edges from 0 to {count - 1}")
+        if verb not in _SWITCHES or not rows or not all(0 <= row < count for row in rows):
+            raise GraphError(f"{verb}: expected {', '.join(_SWITCHES)} and rows of edges from 0 to {count - 1}")
         pairs = tuple(dict.fromkeys(self.names(rows)))
         switches = self.decisions.history.switches
         if all(switches.get(pair) == _SWITCHES[verb] for pair in pairs):
             raise GraphError(f"{', '.join(pairs)}: {_SWITCHES[verb]} already")
-        self._change(lambda: self.decisions.add(revision, _EDITS[verb](pairs), self._entry(rows, note)))
+        decision: dict[str, Any] = {verb: pairs}
+        self._change(lambda: self.decisions.add(revision, Edit(**decision), self._entry(rows, note)))
 
     def disable_wrong(self, revision: int, note: str = "") -> None:
         """Disable every edge that counts, is wrong and undecided. Raises as `decide`."""

@@ -44,7 +44,7 @@ class Points:
 
     def model(self, count: int) -> tuple[csr_matrix, Floats]:
         """The normal equations, matrix and right side, of their least squares in the twists of all poses."""
-        by_twist = _lever(self.found)
+        by_twist = se3.by_twist(self.found)
         weighted = np.swapaxes(by_twist, 1, 2) @ self.information
         right = np.zeros((count, 6))
         np.add.at(right, self.vertices, np.einsum("nij,nj->ni", weighted, self.left))
@@ -70,7 +70,7 @@ class Bent:
         twists = np.zeros((len(vertices), 6, 6))
         for a, b in product(range(node.shape[1]), repeat=2):
             twists += (share[:, a] * share[:, b])[:, None, None] * self.spread[node[:, a], :, node[:, b], :]
-        moved = _lever(points - self.centre)
+        moved = se3.by_twist(points - self.centre)
         return np.asarray(moved @ twists @ np.swapaxes(moved, 1, 2))
 
 
@@ -253,12 +253,6 @@ def _layouts(poses: Floats, pieces: Sequence[Ints]) -> list[_NodeLayout]:
         layouts.append(_NodeLayout(node, share, len(pieces), count))
         parts = max(1, 2 * parts)
     return layouts
-
-
-def _lever(points: Floats) -> Floats:
-    """The derivative (P, 3, 6) of points (P, 3) by a twist about the origin."""
-    unit = np.broadcast_to(np.eye(3), (len(points), 3, 3))
-    return np.concatenate([-se3.hat(points), unit], axis=2)
 
 
 def _shifted(poses: Floats, shift: Floats) -> Floats:

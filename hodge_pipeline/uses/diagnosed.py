@@ -12,7 +12,7 @@ import numpy as np
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import WRONG, Diagnosis
-from hodge_pipeline.pairs.edits import EDGES, joining, pair_names, read_history
+from hodge_pipeline.pairs.edits import EDGES, FILE, joining, pair_names, read_history
 from hodge_pipeline.recipe.round_options import SuggestionOptions
 from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.report.advice import advice, in_unit, ranked
@@ -134,7 +134,7 @@ def _harmless(report: Report) -> str:
 
 def _edited(path: Path, graph: ViewGraph, edges: Edges) -> Edges:
     """The edges with those disabled that the present edits in the folder disable, and no others."""
-    disabled = read_history(path).disabled if path.is_dir() else ()
+    disabled = read_history(path / FILE).disabled if path.is_dir() else ()
     edges = edges.put(edges.status == DISABLED, status=USED)
     return edges.put(joining(graph.vertex_ids, graph.edges, *disabled), status=DISABLED)
 

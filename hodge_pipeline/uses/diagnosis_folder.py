@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,9 +34,7 @@ def write_diagnosed(out: Path, diagnosed: Diagnosed) -> None:
     write_edges(out / "edges.csv", edges, names, has_metres=subject.has_metres)
     _write_poses(out / "poses.tum", subject, found)
     artifacts.write_text(out / "diagnosis.html", render(document(_page(diagnosed))))
-    identity = hashlib.sha256(np.ascontiguousarray(found.world_from_cam).tobytes()).hexdigest()[:32]
-    placed = pieces_apart(found.world_from_cam, found.piece)
-    write_diagnosis(out / "diagnosis.rrd", identity, subject.graph, placed, found)
+    write_diagnosis(out / "diagnosis.rrd", subject.graph, pieces_apart(found.world_from_cam, found.piece), found)
 
 
 def _write_poses(path: Path, subject: DiagnosisSubject, found: Diagnosis) -> None:

@@ -92,4 +92,4 @@ def made(scratch: Path) -> Made:
 def edit(folder: Path) -> None:
     """Switch the first edge off."""
     first = (folder / "edges.csv").read_text("utf-8").splitlines()[1].split(",")
-    write_history(folder, History((Edit(disable=(f"{first[0]}-{first[1]}",)),)))
+    write_history(folder / "edits.json", History((Edit(disable=(f"{first[0]}-{first[1]}",)),)))

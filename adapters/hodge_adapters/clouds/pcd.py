@@ -151,7 +151,8 @@ def _read_ascii(path: Path, contents: bytes, header: PcdHeader) -> Iterator[dict
 
 
 def _read_binary(path: Path, contents: bytes, header: PcdHeader) -> Iterator[dict[str, Any]]:
-    _check_room(path, header, len(contents) - header.start)
+    if header.count * header.dtype.itemsize > len(contents) - header.start:
+        raise SourceError(f"{path}: says {header.count} points, which its bytes cannot hold: copy it again")
     table = np.frombuffer(contents, header.dtype, header.count, header.start)
     yield from parts_of({name: table[name] for name, _, count in header.fields if count == 1})
 
@@ -177,8 +178,3 @@ def _read_compressed(path: Path, contents: bytes, header: PcdHeader) -> Iterator
             columns[name] = column
         at += column.nbytes
     yield from parts_of(columns)
-
-
-def _check_room(path: Path, header: PcdHeader, room: int) -> None:
-    if header.count * header.dtype.itemsize > room:
-        raise SourceError(f"{path}: says {header.count} points, which its bytes cannot hold: copy it again")

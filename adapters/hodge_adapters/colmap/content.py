@@ -16,7 +16,7 @@ from hodge_adapters.colmap.binary import content_arrays
 from hodge_adapters.colmap.check import REMEDY, check_files, check_words, names_with_blanks
 from hodge_adapters.colmap.files import MODEL_FILES, model_ending
 from hodge_adapters.colmap.pycolmap_import import pycolmap
-from hodge_adapters.colmap.records import NO_POINT, CameraRecord, ImageRecord, Model, Points, matrix_of
+from hodge_adapters.colmap.records import NO_POINT, CameraRecord, ImageRecord, Model, matrix_of
 from hodge_adapters.text_rows import natural
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -101,7 +101,9 @@ def content_of(reconstruction: pycolmap.Reconstruction, tracks: bool = True) -> 
         key: CameraRecord(key, camera.model.name, camera.width, camera.height, tuple(camera.params))
         for key, camera in reconstruction.cameras.items()
     }
-    return Model(cameras, images, _seen_by(points, [image.image_id for image in images]))
+    # what an image without a pose saw tells nothing
+    posed_entries = np.isin(points.image_ids, [image.image_id for image in images])
+    return Model(cameras, images, points if posed_entries.all() else points.seen_by(posed_entries))
 
 
 def checked_content(reconstruction: pycolmap.Reconstruction, where: Path, tracks: bool = True) -> Model:
@@ -203,12 +205,3 @@ def _check(model: Model, where: Path) -> None:
 def _pose(image: pycolmap.Image) -> Floats:
     """COLMAP's `cam_from_world`, inverted: the one place where this is done."""
     return se3.inverse(matrix_of(image.cam_from_world()))
-
-
-def _seen_by(points: Points, image_ids: Sequence[int]) -> Points:
-    """The points with the entries of these images alone: what an image without a pose saw tells nothing."""
-    kept = np.isin(points.image_ids, image_ids)
-    if kept.all():
-        return points
-    offsets = np.concatenate([[0], np.cumsum(kept)])[points.offsets].astype(np.int64)
-    return replace(points, offsets=offsets, image_ids=points.image_ids[kept], columns=points.columns[kept])

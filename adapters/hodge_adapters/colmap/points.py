@@ -37,8 +37,7 @@ def points_of_rays(model: Model, world_from_cam: Floats) -> Floats:
     if not count:
         return np.zeros((0, 3))
     image, centre, ray, owner = _rays(model, world_from_cam)
-    old = np.array([one.world_from_cam for one in model.images])
-    moves = world_from_cam @ se3.inverse(old)
+    moves = world_from_cam @ se3.inverse(model.world_from_cam)
     carried = _mean(se3.transform(moves[image], points.xyz[owner][:, None])[:, 0], owner, count)
     met = nearest_to_rays(centre, ray, owner, count)
     choices = np.stack([points.xyz, carried, np.where(np.isnan(met), carried, met)])
@@ -60,7 +59,7 @@ def nearest_to_rays(centre: Floats, ray: Floats, owner: Ints, count: int) -> Flo
 
 def parallaxes(model: Model) -> Floats:
     """The angle (P,) in degrees between the rays to each point: twice that of the widest to their mean."""
-    centres = np.array([image.world_from_cam[:3, 3] for image in model.images]).reshape(-1, 3)
+    centres = model.world_from_cam[:, :3, 3]
     points, owner = model.points, model.points.owners
     ray = points.xyz[owner] - centres[model.image_rows]
     ray = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-300)

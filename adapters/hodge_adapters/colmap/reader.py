@@ -37,9 +37,10 @@ from hodge_adapters.colmap.files import (
     unread_text,
 )
 from hodge_adapters.colmap.records import CameraRecord, ImageRecord, Model
-from hodge_adapters.colmap.scale import metres_per_unit, scaled_graph, scaled_poses
+from hodge_adapters.colmap.scale import metres_per_unit
 from hodge_adapters.images import pixels
 from hodge_adapters.text_rows import inside, listed
+from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import EncodedImage, Floats, Frame, ImageFile, Source, Trajectory, ViewGraph
@@ -132,7 +133,7 @@ class ColmapReader:
         if self.depth != "none" and 0 < len(readable) < len(depths):
             notes.append(f"{len(depths) - len(readable)} of {len(depths)} images have no depth")
         scale = self._scale(model, depths, notes)
-        poses = scaled_poses(np.array([image.world_from_cam for image in model.images]), scale)
+        poses = se3.rescaled(model.world_from_cam, scale)
         sizes = _sizes(model, depths)
         try:
             frames = tuple(
@@ -147,14 +148,14 @@ class ColmapReader:
         if lost:
             advice = "" if colour_folder else ": images=FOLDER names where they are"
             notes.append(f"{len(lost)} of {len(frames)} images are not there as files: {listed(lost)}{advice}")
-        graph, database = self._graph(folder, model, bool(readable), notes)
+        graph, database = self._graph(folder, model, bool(readable), scale, notes)
         files = (*model.files, *database, *readable.values())
         return Source(
             name=path.resolve().name,
             path=path,
             frames=frames[:: self.every],
             trajectory=Trajectory(np.arange(len(poses), dtype=float), poses, has_stamps=False),
-            graph=None if graph is None else scaled_graph(graph, scale),
+            graph=graph,
             notes=tuple(notes),
             files=files,
             in_metres=self.scale != "auto" or scale != 1.0,  # which says that no depth told
@@ -227,8 +228,9 @@ class ColmapReader:
         )
 
     def _graph(
-        self, folder: Path, model: Model, has_depth: bool, notes: list[str]
+        self, folder: Path, model: Model, has_depth: bool, scale: float, notes: list[str]
     ) -> tuple[ViewGraph | None, tuple[Path, ...]]:
+        """The measured graph in metres, and the database that it rests on."""
         database = find_database(folder)
         kind = self.edges
         if kind == "auto":
@@ -246,6 +248,11 @@ class ColmapReader:
         graph = measured_graph(model, pairs, self.min_shared // 2, self.seed, notes)
         notes.append(
             f"{counted(graph.edge_count, 'edge')} estimated anew ({kind}); their scale is that of the model's points"
+        )
+        graph = replace(
+            graph,
+            i_from_j=se3.rescaled(graph.i_from_j, scale),
+            information=se3.rescaled_information(graph.information, scale),
         )
         return graph, (database,) if database and kind == "database" else ()
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types import Bools, Floats, Ints
 
 NO_POINT = -1
 """COLMAP's mark of an observation of no point, 2^64 − 1, as a signed number."""
@@ -61,6 +61,11 @@ class Points:
         """The row (T,) of the point that each entry of a track belongs to."""
         return np.repeat(np.arange(len(self.ids)), np.diff(self.offsets))
 
+    def seen_by(self, kept: Bools) -> Points:
+        """The points with these entries (T,) of their tracks alone."""
+        counts = np.bincount(self.owners[kept], minlength=len(self.ids))
+        return Points(self.ids, self.xyz, np.r_[0, np.cumsum(counts)], self.image_ids[kept], self.columns[kept])
+
     def rows_of(self, ids: Ints) -> Ints:
         """The rows (N,) of points by their ids (N,), −1 of those that are not there."""
         if not len(self.ids):
@@ -78,6 +83,11 @@ class Model:
     points: Points
     files: tuple[Path, ...] = ()
     notes: tuple[str, ...] = ()
+
+    @property
+    def world_from_cam(self) -> Floats:
+        """The poses (N, 4, 4) of the images."""
+        return np.array([image.world_from_cam for image in self.images]).reshape(-1, 4, 4)
 
     @cached_property
     def image_rows(self) -> Ints:

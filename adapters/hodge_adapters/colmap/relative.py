@@ -105,7 +105,7 @@ def by_structure(sighting: Sighting, min_inliers: int, seed: int) -> tuple[Relat
         return None
     i_from_world, j_from_world = motions
     used = rows[agreeing]
-    variance, normal = 0.0, np.zeros((6, 6))
+    variance = 0.0
     pixel = 0.5 / sighting.camera_i.mean_focal_length() + 0.5 / sighting.camera_j.mean_focal_length()
     for camera, pixels, motion in (
         (sighting.camera_i, sighting.pixels_i, i_from_world),
@@ -114,9 +114,9 @@ def by_structure(sighting: Sighting, min_inliers: int, seed: int) -> tuple[Relat
         seen = se3.transform(motion, sighting.xyz[used])
         plane = seen[:, :2] / seen[:, 2:]
         variance += 0.5 * float(np.nanmean((plane - np.asarray(camera.cam_from_img(pixels[used]))) ** 2))
-        normal = _pose_normal(seen)
     sigma = max(float(np.sqrt(variance)), LEAST_ERROR_PX * pixel)
     # both poses are as uncertain, and together twice
+    normal = _pose_normal(se3.transform(j_from_world, sighting.xyz[used]))
     information = 0.5 * normal / sigma**2 * min(1.0, INDEPENDENT_POINTS / len(used))
     return Relative(i_from_world @ se3.inverse(j_from_world), information, round(share * count)), share
 
@@ -127,8 +127,7 @@ def _pose_normal(seen: Floats) -> Floats:
     slopes = np.zeros((len(seen), 2, 3))
     slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0 / depth
     slopes[:, :, 2] = -seen[:, :2] / depth[:, None] ** 2
-    motion = np.concatenate([se3.hat(seen), np.broadcast_to(-np.eye(3), (len(seen), 3, 3))], axis=2)
-    jacobian = (slopes @ motion).reshape(-1, 6)
+    jacobian = (slopes @ se3.by_twist(seen)).reshape(-1, 6)
     return np.asarray(jacobian.T @ jacobian)
 
 

@@ -12,7 +12,7 @@ from hodge_adapters.colmap.bodies import Bodies
 from hodge_adapters.colmap.cameras import colmap_camera
 from hodge_adapters.colmap.points import points_of_rays
 from hodge_adapters.colmap.pycolmap_import import pycolmap
-from hodge_adapters.colmap.records import Model, Points, matrix_of
+from hodge_adapters.colmap.records import Model, matrix_of
 from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, Floats, Ints
 from hodge_pipeline.types.arrays import evenly
@@ -51,14 +51,10 @@ def _seen_by_others(model: Model, bodies: Bodies, chosen: Bools) -> Model:
     """The model with its points where the other bodies see them, and none of which fewer than two do."""
     points, owner = model.points, model.points.owners
     other = ~chosen[bodies.body_of_image[model.image_rows]]
-    counts = np.bincount(owner[other], minlength=len(points.ids))
-    tracks = Points(points.ids, points.xyz, np.r_[0, np.cumsum(counts)], points.image_ids[other], points.columns[other])
-    poses = np.array([image.world_from_cam for image in model.images])
-    xyz = points_of_rays(replace(model, points=tracks), poses)
-    kept = (counts >= 2)[owner]
-    left = np.bincount(owner[kept], minlength=len(points.ids))
-    offsets = np.r_[0, np.cumsum(left)]
-    return replace(model, points=Points(points.ids, xyz, offsets, points.image_ids[kept], points.columns[kept]))
+    tracks = points.seen_by(other)
+    xyz = points_of_rays(replace(model, points=tracks), model.world_from_cam)
+    kept = (np.diff(tracks.offsets) >= 2)[owner]
+    return replace(model, points=replace(points.seen_by(kept), xyz=xyz))
 
 
 def _placed(model: Model, bodies: Bodies, rows: Ints) -> Floats | None:

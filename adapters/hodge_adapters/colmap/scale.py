@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from hodge_adapters.colmap.cameras import colmap_camera
+from hodge_adapters.colmap.cameras import colmap_camera, scaled_camera
 from hodge_adapters.colmap.edges import positions
 from hodge_adapters.colmap.records import NO_POINT, Model
 from hodge_adapters.images import pixels
 from hodge_adapters.images.lens_models import HALF_PIXEL
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Floats, Floats32, ViewGraph
+from hodge_pipeline.types import Floats, Floats32
 from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.text import counted
 
@@ -62,9 +61,7 @@ def other_camera_note(
     rows = _evenly(sensors, SAMPLED_IMAGES)
     for row, depth in _read({row: sensors[row] for row in rows}, units_per_metre, no_depth):
         record = model.cameras[model.images[row].camera_id]
-        camera, size = colmap_camera(record), (depth.shape[1], depth.shape[0])
-        if size != (record.width, record.height):
-            camera.rescale(*size)
+        camera = scaled_camera(record, (depth.shape[1], depth.shape[0]))
         centre = camera.principal_point_x - HALF_PIXEL, camera.principal_point_y - HALF_PIXEL
         for factor, found in depths.items():
             given = factor * camera.focal_length_x, factor * camera.focal_length_y, *centre
@@ -77,21 +74,6 @@ def other_camera_note(
         f"depth seems to be of another camera than the images: half of its ratios to the points lie within "
         f"{spreads[best]:.1%} instead of {spreads[1.0]:.1%} with a focal length {best:g} times theirs: "
         "give --depth-camera"
-    )
-
-
-def scaled_poses(world_from_cam: Floats, scale: float) -> Floats:
-    """The poses with their positions in metres."""
-    scaled: Floats = world_from_cam.copy()
-    scaled[:, :3, 3] *= scale
-    return scaled
-
-
-def scaled_graph(graph: ViewGraph, scale: float) -> ViewGraph:
-    """The graph with translations and their information in metres."""
-    unit = np.array([1.0, 1.0, 1.0, scale, scale, scale])
-    return replace(
-        graph, i_from_j=scaled_poses(graph.i_from_j, scale), information=graph.information / np.outer(unit, unit)
     )
 
 

@@ -231,9 +231,8 @@ class ColmapModel:
         """The model in the world of what is known of its images; as it is, with a note, where that does not tell."""
         if not self.known.images:
             return self
-        images = self.records.images
-        poses = np.array([image.world_from_cam for image in images])
-        found = placing([image.name for image in images], poses, self.known.images, self.known.sigma_m)
+        names, poses = [image.name for image in self.records.images], self.records.world_from_cam
+        found = placing(names, poses, self.known.images, self.known.sigma_m)
         if isinstance(found, str):
             return replace(self, notes=(*self.notes, found))
         copy = self._copy()
@@ -334,8 +333,8 @@ class ColmapModel:
         )
         if loose:
             after = refreshed(self.records, copy)
-            poses = np.array([image.world_from_cam for image in after.images])
-            for point_id, xyz in zip(after.points.ids.tolist(), points_of_rays(after, poses), strict=True):
+            found = points_of_rays(after, after.world_from_cam)
+            for point_id, xyz in zip(after.points.ids.tolist(), found, strict=True):
                 if point_id in loose:
                     copy.points3D[point_id].xyz = xyz
         update_errors(copy)

@@ -60,7 +60,7 @@ def information(model: Model, bodies: Bodies) -> PoseInformation:
 
 def _are_apart(model: Model) -> Bools:
     """Which entries of tracks (T,) have their point farther from the camera than `LEAST_DISTANCE`."""
-    centres = np.array([image.world_from_cam[:3, 3] for image in model.images]).reshape(-1, 3)
+    centres = model.world_from_cam[:, :3, 3]
     away = np.linalg.norm(model.points.xyz[model.points.owners] - centres[model.image_rows], axis=1)
     return np.asarray(away > LEAST_DISTANCE * np.median(away)) if len(away) else np.zeros(0, bool)
 
@@ -128,8 +128,7 @@ def _derivatives(model: Model, bodies: Bodies, used: Bools) -> Iterator[tuple[in
         ]
         slopes = [(ahead - behind) / (2 * step) for ahead, behind in ends]
         by_body_point = np.stack(slopes, axis=2) @ cam_from_body[:3, :3]
-        # a body at T exp(ξ) sees the point at x − φ × x − ρ
-        motion = np.concatenate([se3.hat(in_body), np.broadcast_to(-np.eye(3), (len(here), 3, 3))], axis=2)
         good = np.isfinite(by_body_point).all(axis=(1, 2))
         by_point = by_body_point @ body_from_world[:3, :3]
-        yield number, _Rows((by_body_point @ motion)[good], by_point[good], owner[here][good])
+        # a body at T exp(ξ) sees the point at exp(−ξ) x
+        yield number, _Rows((-by_body_point @ se3.by_twist(in_body))[good], by_point[good], owner[here][good])

@@ -141,7 +141,8 @@ def estimated_poses(path: Path, numbers: list[int], notes: list[str]) -> tuple[F
     """Poses (N, 4, 4) of these frames by another program, NaN where there is none: Redwood's `trajectory.log`, Stray
     Scanner's `odometry.csv`, or ScanNet's `pose/0.txt`, …; and the path of the file, if there is one.
     """
-    log, stray, folder = find_log(path), path / STRAY_FILE, path / "pose"
+    log = next((path / name for name in LOG_FILES if (path / name).is_file()), None)
+    stray, folder = path / STRAY_FILE, path / "pose"
     file = log or (stray if stray.is_file() else None)
     if file is None and not folder.is_dir():
         return np.full((len(numbers), 4, 4), np.nan), None
@@ -154,11 +155,6 @@ def estimated_poses(path: Path, numbers: list[int], notes: list[str]) -> tuple[F
     if without:
         notes.append(f"{without} of {len(poses)} frames have no pose in it")
     return poses, file
-
-
-def find_log(folder: Path) -> Path | None:
-    """The trajectory of a folder, by its usual places."""
-    return next((folder / name for name in LOG_FILES if (folder / name).is_file()), None)
 
 
 def _stray_poses(file: Path) -> dict[int, Floats]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -250,24 +251,17 @@ def _add_transform(recording: Recording, transform: Message, logged: Logged) -> 
     recording.transforms.add(parent, child, stamp, values, is_static=is_static)
 
 
-def _images(recording: Recording) -> dict[str, list[Seen[ImageLayout]]]:
-    return recording.images
-
-
-def _clouds(recording: Recording) -> dict[str, list[Seen[CloudLayout]]]:
-    return recording.clouds
-
-
-_RAW_IMAGE = _adds(_images, lambda message, length, _: raw_layout(message, length))
-_LIVOX_CLOUD = _adds(_clouds, livox_layout)
-_CODED_IMAGE = _adds(_images, lambda message, _, contents: compressed_layout(message, contents))
+_IMAGES, _CLOUDS = attrgetter("images"), attrgetter("clouds")
+_RAW_IMAGE = _adds(_IMAGES, lambda message, length, _: raw_layout(message, length))
+_LIVOX_CLOUD = _adds(_CLOUDS, livox_layout)
+_CODED_IMAGE = _adds(_IMAGES, lambda message, _, contents: compressed_layout(message, contents))
 _KINDS: dict[tuple[str, str], Add] = {
     ("sensor", "Image"): _RAW_IMAGE,
     ("sensor", "CompressedImage"): _CODED_IMAGE,
     ("foxglove", "RawImage"): _RAW_IMAGE,
     ("foxglove", "CompressedImage"): _CODED_IMAGE,
-    ("sensor", "PointCloud2"): _adds(_clouds, lambda message, length, _: ros_layout(message, length)),
-    ("foxglove", "PointCloud"): _adds(_clouds, lambda message, length, _: foxglove_layout(message, length)),
+    ("sensor", "PointCloud2"): _adds(_CLOUDS, lambda message, length, _: ros_layout(message, length)),
+    ("foxglove", "PointCloud"): _adds(_CLOUDS, lambda message, length, _: foxglove_layout(message, length)),
     ("livox_ros_driver", "CustomMsg"): _add_livox,
     ("livox_ros_driver2", "CustomMsg"): _add_livox,
     ("livox_interfaces", "CustomMsg"): _add_livox,

@@ -90,11 +90,10 @@ def surface_decomposition(d0: csr_matrix, d1: csr_matrix, omega: Floats, weights
     """`hodge_decomposition` of a closed surface, whose co-exact part costs a factorisation too: on the dual graph
     W⁻¹ d1ᵀ g is a gradient again, fitted to W (ω − d0 f) in the weights 1 / w.
     """
-    potential = gradient_fit(d0, omega, weights)
-    exact = np.asarray(d0 @ potential)
+    exact = np.asarray(d0 @ gradient_fit(d0, omega, weights))
     rest, dual = omega - exact, csr_matrix(d1.T, dtype=float)
     coexact = np.asarray(dual @ gradient_fit(dual, weights[:, None] * rest, 1.0 / weights)) / weights[:, None]
-    return HodgeDecomposition(potential, exact, coexact, rest - coexact, weights)
+    return HodgeDecomposition(exact, coexact, rest - coexact, weights)
 
 
 def make_surface(edges: Ints, world_from_cam: Floats, rotation: RotationSystem, seed: int) -> PaperSurface:
