@@ -49,6 +49,13 @@ def test_a_wrong_convention_is_named(name: str, seed: int) -> None:
     assert not right.wrong and right.missed < 0.5
 
 
+@pytest.mark.parametrize("times", [5.0, 8.0])
+def test_poses_of_another_scale_are_no_millimetres(times: float) -> None:
+    """Of a camera that turns more than it moves, lengths of next to nothing miss less than those of a wrong scale."""
+    poses, edges, motions = registered(0)
+    assert not explained(se3.rescaled(poses, times), edges, motions, 1.0).wrong
+
+
 def test_poor_poses_are_of_no_other_convention() -> None:
     """Noise larger than the steps; a camera that stands still, or slides without a turn."""
     poses, edges, motions = registered(0)

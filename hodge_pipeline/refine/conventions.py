@@ -13,7 +13,9 @@ from hodge_pipeline.types.text import counted
 
 EXPLAINS = 0.5
 """Poses explain edges of which they miss less than half of the motion, in the median, and another reading explains them
-better where it misses less than half of what this one does; still poses miss all of it."""
+better where it misses less than half of what this one does; still poses miss all of it. It must be
+better than their turns alone, too: poses of any wrong scale miss less where their lengths are next to nothing.
+"""
 FEWEST_EDGES = 6
 SAME_RAD = 1e-6
 """Rotations nearer to each other are written alike."""
@@ -101,7 +103,8 @@ def explained(
         _missed_m(se3.between(reading.of(world_from_key), edges), i_from_j, arm_m) / motion_m for reading in READINGS
     ]
     best = int(np.argmin(as_others))
-    if as_others[best] >= EXPLAINS * min(missed, 1.0):
+    without_lengths = _missed_m(se3.between(se3.rescaled(world_from_key, 0.0), edges), i_from_j, arm_m) / motion_m
+    if as_others[best] >= EXPLAINS * min(missed, without_lengths, 1.0):
         return Explained(missed)
     shares = f"as such they miss {as_others[best]:.2f} of the motion (median {of}), as they were read {missed:.2f}"
     looks = f"the {poses} look like {READINGS[best].looks}"
