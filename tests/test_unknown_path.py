@@ -33,6 +33,7 @@ def test_a_folder_of_sources_names_them(tmp_path: Path) -> None:
     tum_folder(tmp_path / "data/room/first")
     (tmp_path / "data/loop.g2o").write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
     (tmp_path / "data/again").symlink_to(tmp_path)
+    (tmp_path / "data/main.cpp").write_text('// reads "PinholeCameraTrajectory" and "PoseGraph"\n')
     told = complaint(tmp_path)
     assert told.endswith(f"give {tmp_path / 'data/loop.g2o'} (g2o), {tmp_path / 'data/room/first'} (tum)")
 
