@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -57,6 +58,13 @@ def test_images_of_another_format_are_told_what_to_become(tmp_path: Path) -> Non
     assert "convert 0.pgm" in complaint(tmp_path / "depth") and "convert 0.pgm" in complaint(tmp_path / "depth/0.pgm")
 
 
+def test_depth_beside_colour_in_another_format_is_told_what_to_become(tmp_path: Path) -> None:
+    for name in ("depth/1.pgm", "color/1.png"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_bytes(b"P5 1 1 65535 00")
+    assert complaint(tmp_path).endswith("no PNG in it: convert 1.pgm and its like to PNG, depth with all 16 bits")
+
+
 def test_images_in_an_unknown_layout_are_told_which_is_known(tmp_path: Path) -> None:
     (tmp_path / "depth_0001.png").write_bytes(b"")
     assert "put depth (PNG of 16 bits, millimetres) in depth/ and colour in color/" in complaint(tmp_path)
@@ -110,6 +118,9 @@ def test_a_model_further_down_is_named(tmp_path: Path, ending: str) -> None:
             opened(tmp_path)
         with pytest.raises(SourceError, match=f"one file of a COLMAP model: give its folder {model}$"):
             opened(model / f"images.{ending}")
+    shutil.copytree(model, tmp_path / "text")
+    with pytest.raises(SourceError, match=f"holds some below: give {model}, {tmp_path / 'text'}$"):
+        ColmapModels().open_models(tmp_path)
         with pytest.raises(SourceError, match="no such file or folder"):
             opened(tmp_path / "nowhere")
         with pytest.raises(SourceError, match="no COLMAP model: give the folder with cameras.bin"):

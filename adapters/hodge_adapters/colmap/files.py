@@ -14,6 +14,7 @@ from hodge_pipeline.types.text import counted
 MODEL_PLACES = ("", "sparse", "sparse/0", "0", "colmap/sparse/0", "colmap", "dense/sparse", "dense/0/sparse")
 PARENTS = 3
 LOOKED_AT = 60
+NAMED = 3
 IMAGE_FOLDERS = ("images", "image", "rgb", "color")
 ENDINGS = (".bin", ".txt")
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
@@ -48,11 +49,13 @@ def no_model(path: Path) -> SourceError:
     if not path.exists():
         return SourceError(f"{path}: no such file or folder")
     advice = part_of_model(path) or "no COLMAP model: give the folder with cameras.bin and images.bin, or .txt"
-    for place in ("*", "*/*", "*/*/*") if path.is_dir() else ():
-        below = sorted({found.parent for found in islice(path.glob(f"{place}/cameras.*"), LOOKED_AT)})
-        models = [folder for folder in below if model_ending(folder)]
-        if models:
-            return SourceError(f"{path}: no COLMAP model itself, but holds some below: give {models[0]}")
+    places = ("*", "*/*", "*/*/*") if path.is_dir() else ()
+    below = (found for place in places for found in islice(path.glob(f"{place}/cameras.*"), LOOKED_AT))
+    models = [str(folder) for folder in dict.fromkeys(found.parent for found in below) if model_ending(folder)]
+    if models:
+        more = "" if len(models) <= NAMED else " and others"
+        given = ", ".join(sorted(models)[:NAMED])
+        return SourceError(f"{path}: no COLMAP model itself, but holds some below: give {given}{more}")
     return SourceError(f"{path}: {advice}")
 
 
