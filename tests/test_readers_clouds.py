@@ -26,7 +26,8 @@ def test_a_folder_with_poses_and_pairs(tmp_path: Path) -> None:
     folder = fragments(tmp_path / "f")
     poses = some_poses(3)
     blocks = [log_block(5 * k, 5 * k, pose) for k, pose in enumerate(poses[:2])]
-    (folder / "all.log").write_text("".join([*blocks, log_block(0, 5, poses[2]), log_block(0, 99, poses[2])]))
+    blocks += [log_block(0, 5, poses[2]), log_block(0, 99, poses[2]), log_block(7, 7, poses[2])]
+    (folder / "all.log").write_text("".join(blocks))
     source = check_reader(CloudFolderReader(), folder)
     assert [frame.frame_id for frame in source.frames] == ["cloud_bin_0.ply", "cloud_bin_5.ply", "cloud_bin_10.ply"]
     np.testing.assert_allclose(source.frames[1].world_from_cam, poses[1], atol=1e-12)
@@ -35,6 +36,7 @@ def test_a_folder_with_poses_and_pairs(tmp_path: Path) -> None:
     np.testing.assert_allclose(source.graph.i_from_j[0], poses[2], atol=1e-12)
     assert any("1 pair of the log" in note for note in source.notes)
     assert any("1 of 3 fragments have no pose: cloud_bin_10.ply" in note for note in source.notes)
+    assert any("all.log: 1 of 3 poses have no fragment of their number" in note for note in source.notes)
     scaled = CloudFolderReader(units_per_metre=1000.0).open(folder).frames[0].read_points()
     np.testing.assert_allclose(scaled.points_in_cam * 1000, cloud(seed=0).points_in_cam, rtol=1e-5)
 

@@ -19,6 +19,7 @@ from hodge_adapters.colmap.models import ColmapModels
 from hodge_adapters.colmap.reader import ColmapReader
 from hodge_adapters.colmap.writer import ColmapWriter
 from hodge_pipeline.cli.main import app
+from hodge_pipeline.cli.refine_colmap import _lines
 from hodge_pipeline.errors import CheckError, SourceError
 from hodge_pipeline.store.edge_table import read_edges
 from readers_data import write_colour
@@ -63,7 +64,22 @@ def test_one_image_is_refused_alone_and_left_out_beside_others(sparse: Path) -> 
     assert "\n" not in str(refused.value)
     (result,) = hodge_pipeline.refine_colmap(sparse, overrides=FREE).results
     assert result.start.name == str(sparse / "1")
+    named = " ".join(" ".join(_lines(result, alone=False, verbose=False)).split())
+    assert named.startswith(f"of {sparse / '1'} (8 images) verdict "), "of several models each verdict names its own"
     assert [note for note in result.notes if note.startswith(f"left out: {sparse / '0'}: the model has one image")]
+
+
+def test_a_model_without_its_images_or_cameras_names_the_file_that_is_not_there(sparse: Path) -> None:
+    (sparse / "0/images.bin").unlink()
+    (sparse / "1/cameras.bin").unlink()
+    for folder, name in (
+        (sparse.parent, "0/images.bin"),
+        (sparse / "0", "0/images.bin"),
+        (sparse / "1", "1/cameras.bin"),
+    ):
+        for read in (hodge_pipeline.open_source, hodge_pipeline.refine_colmap):
+            with pytest.raises(SourceError, match=f"a COLMAP model without {sparse / name}: copy that file too"):
+                read(folder)
 
 
 def test_models_without_an_observation_are_refused_in_one_line(sparse: Path) -> None:

@@ -229,9 +229,15 @@ def test_sweeps_are_told_from_stations_and_fragments() -> None:
     timed = street()
     plain = [changed(frame, lambda cloud: replace(cloud, times_s=None)) for frame in timed]
     half = [changed(f, lambda c: PointCloud(c.points_in_cam[c.points_in_cam[:, 0] > 0])) for f in timed]
-    for frames, recipe in ((timed, "lidar"), (plain, "lidar"), (half, "scans"), (plain[:5], "scans")):
+    ahead = [changed(f, lambda c: PointCloud(looking_ahead(c.points_in_cam))) for f in plain]
+    for frames, recipe in ((timed, "lidar"), (plain, "lidar"), (half, "scans"), (plain[:5], "scans"), (ahead, "scans")):
         facts = {"frames": len(frames), "formats": [{"reader": "clouds"}], **frame_facts(frames, [])}
         assert next_command(Path("in"), facts, None) == f"hodge run {recipe} --source in --out runs/in"
+
+
+def looking_ahead(points: np.ndarray) -> np.ndarray:
+    """Points as a depth camera of 60 degrees sees them, z ahead: on all sides of its axis."""
+    return points * np.array([1, 1, 0], np.float32) + np.linalg.norm(points, axis=1)[:, None] * [0, 0, np.sqrt(3)]
 
 
 def mirrored(cloud: PointCloud) -> PointCloud:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,7 @@ def test_a_folder_of_sources_names_them(tmp_path: Path) -> None:
     tum_folder(tmp_path / "data/room/first")
     (tmp_path / "data/loop.g2o").write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
     (tmp_path / "data/again").symlink_to(tmp_path)
+    (tmp_path / "data/main.cpp").write_text('// reads "PinholeCameraTrajectory" and "PoseGraph"\n')
     told = complaint(tmp_path)
     assert told.endswith(f"give {tmp_path / 'data/loop.g2o'} (g2o), {tmp_path / 'data/room/first'} (tum)")
 
@@ -54,6 +56,13 @@ def test_images_of_another_format_are_told_what_to_become(tmp_path: Path) -> Non
     (tmp_path / "depth/0.pgm").write_bytes(b"P5 1 1 65535 00")
     assert complaint(tmp_path).endswith("convert depth/0.pgm and its like to PNG, depth with all 16 bits")
     assert "convert 0.pgm" in complaint(tmp_path / "depth") and "convert 0.pgm" in complaint(tmp_path / "depth/0.pgm")
+
+
+def test_depth_beside_colour_in_another_format_is_told_what_to_become(tmp_path: Path) -> None:
+    for name in ("depth/1.pgm", "color/1.png"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_bytes(b"P5 1 1 65535 00")
+    assert complaint(tmp_path).endswith("no PNG in it: convert 1.pgm and its like to PNG, depth with all 16 bits")
 
 
 def test_images_in_an_unknown_layout_are_told_which_is_known(tmp_path: Path) -> None:
@@ -109,6 +118,9 @@ def test_a_model_further_down_is_named(tmp_path: Path, ending: str) -> None:
             opened(tmp_path)
         with pytest.raises(SourceError, match=f"one file of a COLMAP model: give its folder {model}$"):
             opened(model / f"images.{ending}")
+    shutil.copytree(model, tmp_path / "text")
+    with pytest.raises(SourceError, match=f"holds some below: give {model}, {tmp_path / 'text'}$"):
+        ColmapModels().open_models(tmp_path)
         with pytest.raises(SourceError, match="no such file or folder"):
             opened(tmp_path / "nowhere")
         with pytest.raises(SourceError, match="no COLMAP model: give the folder with cameras.bin"):

@@ -37,7 +37,7 @@ class Open3dReader:
         """By the class that the file names near its beginning, or the keys that such a class begins with."""
         text = first_text(Path(path))
         for name in (GRAPH, TRAJECTORY):
-            if f'"{name}' in text:
+            if text.lstrip().startswith("{") and f'"{name}' in text:
                 return Sniff(0.95, f"class_name {name}")
         return Sniff(0.0, "no JSON of Open3D")
 

@@ -71,11 +71,15 @@ def _print_tables(result: RefinedModel) -> None:
 
 
 def _lines(result: RefinedModel, *, alone: bool, verbose: bool) -> list[str]:
-    """The result of a model in eight lines of 80 columns, two where there are several; `verbose`: every note, whole."""
+    """The result of a model in eight lines of 80 columns, where there are several three, the first of which names it;
+    `verbose`: every note, whole.
+    """
     decision = result.decision
     told = decision.outcome in decision.reason  # "already optimal: …" says it
     outcome = "" if told else {"worse": "kept as given"}.get(decision.outcome, decision.outcome)
-    lines = labelled("verdict", ": ".join(filter(None, (decision.doubt, outcome, decision.reason))))
+    named = ", ".join(f"{model.name} ({counted(model.quality.images, 'image')})" for model in result.inputs)
+    lines = [] if alone else labelled("of", named)
+    lines += labelled("verdict", ": ".join(filter(None, (decision.doubt, outcome, decision.reason))))
     if verbose or alone:
         lines += [f"  - {measure}" for measure in decision.measures[: len(decision.measures) if verbose else MEASURES]]
     if verbose and decision.change is not None:

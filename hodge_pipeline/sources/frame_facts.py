@@ -92,10 +92,19 @@ def _scanner_facts(frames: Sequence[Frame], oddities: list[str]) -> dict[str, An
         return {}
     if cloud.times_s is not None:
         return {"scanner": "turns while it moves: its points have times"}
-    turns = np.arctan2(cloud.points_in_cam[:, 1], cloud.points_in_cam[:, 0])
-    seen = np.count_nonzero(np.bincount(((turns + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS))
-    sees_round = seen >= ALL_ROUND * SECTORS and len(cloud) <= SWEEP_POINTS
+    sees_round = len(cloud) <= SWEEP_POINTS and _is_all_round(cloud.points_in_cam)
     return {"scanner": "sees all round"} if sees_round else {}
+
+
+def _is_all_round(points: Floats32) -> bool:
+    """Whether points (N, 3) lie on all sides of the z axis, most of them nearer to the horizon than to the axis: those
+    of a depth camera lie on all sides of the axis that it looks along.
+    """
+    x, y, z = points.T
+    level = np.abs(z) < np.hypot(x, y)
+    turns = np.arctan2(y[level], x[level])
+    seen = np.count_nonzero(np.bincount(((turns + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS))
+    return bool(2 * np.count_nonzero(level) > len(points) and seen >= ALL_ROUND * SECTORS)
 
 
 def _middle_cloud(frames: Sequence[Frame], oddities: list[str]) -> PointCloud | None:

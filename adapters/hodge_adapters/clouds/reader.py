@@ -100,6 +100,11 @@ class CloudFolderReader:
         without = [name for number, name in names.items() if number not in poses]
         if poses and without:
             notes.append(f"{len(without)} of {len(numbers)} fragments have no pose: {listed(without)}")
+        if log and (others := len(poses.keys() - names.keys())):
+            notes.append(
+                f"{log.name}: {others} of {len(poses)} poses have no fragment of their number: is it of other frames, "
+                "such as the images that fragments were made of? (option log: another one, or empty for none)"
+            )
         frames = tuple(
             Frame(
                 frame_id=fragment.name,

@@ -14,7 +14,9 @@ from hodge_pipeline.types.text import counted
 MODEL_PLACES = ("", "sparse", "sparse/0", "0", "colmap/sparse/0", "colmap", "dense/sparse", "dense/0/sparse")
 PARENTS = 3
 LOOKED_AT = 60
+NAMED = 3
 IMAGE_FOLDERS = ("images", "image", "rgb", "color")
+ENDINGS = (".bin", ".txt")
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 
 
@@ -24,11 +26,21 @@ def find_model(path: Path) -> Path | None:
 
 
 def part_of_model(path: Path) -> str:
-    """What to give instead of a file of COLMAP's, empty for any other."""
+    """What to give instead of a file of COLMAP's, or of a model that lacks one; empty for any other."""
     if path.suffix == ".db" and path.is_file():
         return "a database of COLMAP's has matches, no poses: give the folder of a model, with --database for this one"
     if path.stem in MODEL_FILES and path.suffix in (".bin", ".txt") and model_ending(path.parent):
         return f"one file of a COLMAP model: give its folder {path.parent}"
+    return next(filter(None, (_lacking(path / place) for place in MODEL_PLACES)), "")
+
+
+def _lacking(folder: Path) -> str:
+    """What a folder with points and either cameras or images lacks to be a model; empty for any other."""
+    for ending in ENDINGS:
+        there = {name: (folder / f"{name}{ending}").is_file() for name in ("cameras", "images", "points3D")}
+        if there["points3D"] and there["cameras"] != there["images"]:
+            (name,) = (name for name, is_there in there.items() if not is_there)
+            return f"a COLMAP model without {folder / name}{ending}: copy that file too"
     return ""
 
 
@@ -37,11 +49,13 @@ def no_model(path: Path) -> SourceError:
     if not path.exists():
         return SourceError(f"{path}: no such file or folder")
     advice = part_of_model(path) or "no COLMAP model: give the folder with cameras.bin and images.bin, or .txt"
-    for place in ("*", "*/*", "*/*/*") if path.is_dir() else ():
-        below = sorted({found.parent for found in islice(path.glob(f"{place}/cameras.*"), LOOKED_AT)})
-        models = [folder for folder in below if model_ending(folder)]
-        if models:
-            return SourceError(f"{path}: no COLMAP model itself, but holds some below: give {models[0]}")
+    places = ("*", "*/*", "*/*/*") if path.is_dir() else ()
+    below = (found for place in places for found in islice(path.glob(f"{place}/cameras.*"), LOOKED_AT))
+    models = [str(folder) for folder in dict.fromkeys(found.parent for found in below) if model_ending(folder)]
+    if models:
+        more = "" if len(models) <= NAMED else " and others"
+        given = ", ".join(sorted(models)[:NAMED])
+        return SourceError(f"{path}: no COLMAP model itself, but holds some below: give {given}{more}")
     return SourceError(f"{path}: {advice}")
 
 
@@ -57,7 +71,7 @@ def unread_text(folder: Path) -> tuple[str, ...]:
 
 def _endings(folder: Path) -> list[str]:
     names = "cameras", "images"
-    return [ending for ending in (".bin", ".txt") if all((folder / f"{name}{ending}").is_file() for name in names)]
+    return [ending for ending in ENDINGS if all((folder / f"{name}{ending}").is_file() for name in names)]
 
 
 def find_folder(model: Path, given: str, usual: Sequence[str]) -> Path | None:

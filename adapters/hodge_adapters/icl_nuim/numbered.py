@@ -21,6 +21,7 @@ from hodge_pipeline.types import Floats
 from hodge_pipeline.types.text import counted
 
 LAYOUT = "put depth (PNG of 16 bits) in depth/ and colour in color/, both named by one number, 00000.png, …"
+OTHER_IMAGES = (".pgm", ".tif", ".tiff", ".exr")
 TUM_FILES = ("depth.txt", "rgb.txt", "groundtruth.txt")
 REPLICA_IMAGES = "results"
 LOG_FILES = ("trajectory.log", "scene/trajectory.log", "test_scene/trajectory.log")
@@ -49,6 +50,11 @@ def find_images(folder: Path) -> tuple[Path, Path] | None:
     return (both, both) if fewer > 1 and 2 * fewer > more else None
 
 
+def _advice(folder: Path) -> str:
+    other = next((name for name in names_in(folder) if Path(name).suffix.lower() in OTHER_IMAGES), None)
+    return LAYOUT if other is None else f"convert {other} and its like to PNG, depth with all 16 bits"
+
+
 def list_images(folder: Path, notes: list[str]) -> StampedImages:
     """The images of a folder by the number in their names, their stamp; depth without colour is noted."""
     if stamped_images(folder / "depth"):
@@ -60,7 +66,7 @@ def list_images(folder: Path, notes: list[str]) -> StampedImages:
     mixed = depth_folder == colour_folder
     depth = _by_number(depth_folder, notes, "depth" if mixed else "")
     if not depth:
-        raise SourceError(f"{depth_folder}: no PNG in it: {LAYOUT}")
+        raise SourceError(f"{depth_folder}: no PNG in it: {_advice(depth_folder)}")
     colour = _by_number(colour_folder, notes, "colour" if mixed else "") if colour_folder else {}
     numbers = sorted(depth)
     alone = [number for number in numbers if number not in colour]
