@@ -271,13 +271,14 @@ def test_key_frames_have_the_points_of_the_sweeps_beside_them() -> None:
     quarter = se3.exp(np.array([0, 0, np.pi / 2, 0, 0, 0]))
     steps_m = np.array([0, 1, 1, 1, 3, 1, 1.0])  # sweep 2 was not found, sweep 4 is far from the one before
     poses = quarter @ se3.from_parts(np.eye(3), np.cumsum(steps_m)[:, None] * [1, 0, 0])
-    post = np.array([9.0, 5, 1])
+    post, reads = np.array([9.0, 5, 1]), list[int]()
 
-    def seen(pose: Floats) -> PointCloud:
+    def seen(number: int, pose: Floats) -> PointCloud:
+        reads.append(number)
         post_in_scan = se3.transform(se3.inverse(pose), post[None])
         return PointCloud(np.concatenate([post_in_scan, np.zeros((1, 3)), [[0.5, 0, 0]]]).astype(np.float32))
 
-    source = Source("", Path(), tuple(Frame(n, n, read_points=partial(seen, pose)) for n, pose in enumerate(poses)))
+    source = Source("", Path(), tuple(Frame(n, n, read_points=partial(seen, n, pose)) for n, pose in enumerate(poses)))
     found = Sweeps(poses, np.zeros((7, 6)), np.arange(7) != 2, np.zeros(7), np.ones(7, np.int64), 25.0)
     sequences = np.arange(6), np.arange(6, 7)
     thick = thickened(source, np.array([0, 3, 5, 6]), found, sequences, CloudOptions(min_range_m=1.0, max_range_m=80.0))
@@ -290,6 +291,7 @@ def test_key_frames_have_the_points_of_the_sweeps_beside_them() -> None:
         assert points.dtype == np.float32 and len(points) == posts + 2  # no return, and what is too near, its own alone
         pose = poses[int(frame.frame_id)]
         assert se3.transform(pose, points)[[0, *range(3, len(points))]] == pytest.approx(np.tile(post, (posts, 1)))
+    assert sorted(reads) == [0, 1, 3, 4, 5, 6], "each once: sweep 1 is lent to two"
 
 
 def test_a_scene_that_changes_is_followed() -> None:
