@@ -117,6 +117,17 @@ def test_after_a_hole_a_start_at_rest_counts_by_all_points_and_by_the_motion_so_
     assert np.linalg.norm((se3.inverse(right) @ moved)[:3, 3]) < 0.3  # at rest 1.8 and 2.4 m off
 
 
+def test_a_turn_on_the_spot_that_ends_within_a_sweep_goes_no_further() -> None:
+    own, rows = scanner_in("office", 4), np.arange(16, 58)
+    exact = own.road.world_from_car((rows + 0.5) * REVOLUTION_S)
+    tracker = ScanToMap(0.218, se3.log(se3.inverse(exact[0]) @ exact[1]) / REVOLUTION_S)
+    for row in rows:
+        tracker.follow(PointCloud((sweep := own.sweep(row)).points, times_s=sweep.times_s), row * REVOLUTION_S)
+    off = se3.log(se3.inverse(se3.inverse(exact[0]) @ exact[-1]) @ tracker.pose)
+    assert np.degrees(np.linalg.norm(off[:3])) < 1.0  # 6.6, where it is deskewed by the turn alone
+    assert np.linalg.norm(off[3:]) < 0.05
+
+
 def test_a_sweep_off_the_even_motion_around_it_is_named() -> None:
     frames, side = street().copy(), np.array([0, 0.4, 0], np.float32)
     frames[13] = changed(frames[13], lambda cloud: replace(cloud, points_in_cam=cloud.points_in_cam + side))
