@@ -117,6 +117,17 @@ def test_after_a_hole_a_start_at_rest_counts_by_all_points_and_by_the_motion_so_
     assert np.linalg.norm((se3.inverse(right) @ moved)[:3, 3]) < 0.3  # at rest 1.8 and 2.4 m off
 
 
+def test_a_turn_on_the_spot_that_ends_within_a_sweep_goes_no_further() -> None:
+    own, rows = scanner_in("office", 4), np.arange(16, 58)
+    exact = own.road.world_from_car((rows + 0.5) * REVOLUTION_S)
+    tracker = ScanToMap(0.218, se3.log(se3.inverse(exact[0]) @ exact[1]) / REVOLUTION_S)
+    for row in rows:
+        tracker.follow(PointCloud((sweep := own.sweep(row)).points, times_s=sweep.times_s), row * REVOLUTION_S)
+    off = se3.log(se3.inverse(se3.inverse(exact[0]) @ exact[-1]) @ tracker.pose)
+    assert np.degrees(np.linalg.norm(off[:3])) < 1.0  # 6.6, where it is deskewed by the turn alone
+    assert np.linalg.norm(off[3:]) < 0.05
+
+
 def test_a_sweep_off_the_even_motion_around_it_is_named() -> None:
     frames, side = street().copy(), np.array([0, 0.4, 0], np.float32)
     frames[13] = changed(frames[13], lambda cloud: replace(cloud, points_in_cam=cloud.points_in_cam + side))
@@ -277,13 +288,14 @@ def test_key_frames_have_the_points_of_the_sweeps_beside_them() -> None:
     quarter = se3.exp(np.array([0, 0, np.pi / 2, 0, 0, 0]))
     steps_m = np.array([0, 1, 1, 1, 3, 1, 1.0])  # sweep 2 was not found, sweep 4 is far from the one before
     poses = quarter @ se3.from_parts(np.eye(3), np.cumsum(steps_m)[:, None] * [1, 0, 0])
-    post = np.array([9.0, 5, 1])
+    post, reads = np.array([9.0, 5, 1]), list[int]()
 
-    def seen(pose: Floats) -> PointCloud:
+    def seen(number: int, pose: Floats) -> PointCloud:
+        reads.append(number)
         post_in_scan = se3.transform(se3.inverse(pose), post[None])
         return PointCloud(np.concatenate([post_in_scan, np.zeros((1, 3)), [[0.5, 0, 0]]]).astype(np.float32))
 
-    source = Source("", Path(), tuple(Frame(n, n, read_points=partial(seen, pose)) for n, pose in enumerate(poses)))
+    source = Source("", Path(), tuple(Frame(n, n, read_points=partial(seen, n, pose)) for n, pose in enumerate(poses)))
     found = Sweeps(poses, np.zeros((7, 6)), np.arange(7) != 2, np.zeros(7), np.ones(7, np.int64), 25.0)
     sequences = np.arange(6), np.arange(6, 7)
     thick = thickened(source, np.array([0, 3, 5, 6]), found, sequences, CloudOptions(min_range_m=1.0, max_range_m=80.0))
@@ -296,6 +308,7 @@ def test_key_frames_have_the_points_of_the_sweeps_beside_them() -> None:
         assert points.dtype == np.float32 and len(points) == posts + 2  # no return, and what is too near, its own alone
         pose = poses[int(frame.frame_id)]
         assert se3.transform(pose, points)[[0, *range(3, len(points))]] == pytest.approx(np.tile(post, (posts, 1)))
+    assert sorted(reads) == [0, 1, 3, 4, 5, 6], "each once: sweep 1 is lent to two"
 
 
 def test_a_scene_that_changes_is_followed() -> None:

@@ -43,6 +43,7 @@ of another city's 0.19, of one in feet 0.01.
 AS_USUAL = 0.9
 """An alignment from the predicted pose with this share of the usual inliers needs none from the coarser levels: on
 streets, in forests, offices and fields that is nearly every sweep, and errors are the same with them and without.
+Likewise one with this share of the usual points on the map needs no other deskewing.
 """
 ON_MAP = 0.5
 """Finest voxels from a Gaussian of the map within which a point lies on it."""
@@ -115,10 +116,26 @@ class ScanToMap:
             self._usual.append(step.on_map)
 
     def place(self, cloud: PointCloud, time_s: float) -> Step:
-        """The sweep that began at `time_s` in the map of those before."""
+        """The sweep that began at `time_s` in the map of those before.
+
+        Where fewer of its points lie on the map than usual, a turn may have ended: deskewed by it, 9 degrees on the
+        spot, sweeps find a place to which the turn goes on. Then it is placed as if the scanner turned no more, too.
+        """
+        step = self._placed(cloud, time_s, self.velocity)
+        if not step.turn_s or not step.on_map < AS_USUAL * _usual(self._usual):
+            return step
+        turning = self._map.latest
+        straight = self._placed(cloud, time_s, np.concatenate([np.zeros(3), self.velocity[3:]]))
+        if straight.on_map > step.on_map:
+            return straight
+        self._map.latest = turning
+        return step
+
+    def _placed(self, cloud: PointCloud, time_s: float, velocity: Floats) -> Step:
+        """The sweep placed, expected to move with this velocity (6,)."""
         turn_s = 0.0 if cloud.times_s is None else float(cloud.times_s.max())
         duration = 0.0 if self._time_s is None else time_s - self._time_s
-        before, velocity, rates = self.pose, self.velocity, [self.velocity]
+        before, rates = self.pose, [velocity]
         predicted, spread = before @ se3.exp(velocity * duration), self.spread
         moved_spread = spread = spread + (ACCELERATION_M_S2 * duration) ** 2 * np.eye(3)
         far_m = _far_m(cloud.points_in_cam)
@@ -181,13 +198,23 @@ def _usual(shares: deque[float]) -> float:
     return float(np.median(shares)) if len(shares) >= FEWEST_USUAL else np.nan
 
 
+class _Latest(NamedTuple):
+    """The sweep aligned last, thinned, if any; its share of inliers, and their mean error; (3, 3) what noise of its
+    normals feigns of the information on translation.
+    """
+
+    sweep: Any = None
+    share: float = np.nan
+    error: float = np.nan
+    spurious: Floats = np.zeros((3, 3))
+
+
 class _Map:
     """Voxels of Gaussians (Koide et al., ICRA 2021) of the sweeps so far, at several sizes, coarse to fine."""
 
     def __init__(self, voxel_m: float, levels: tuple[int, ...], sample_m: float) -> None:
-        self._sample_m, self._is_empty, self._sweep, self._spurious = sample_m * voxel_m, True, None, np.zeros((3, 3))
-        self._share, self._shares = np.nan, deque[float](maxlen=USUAL_OF)  # of inliers: of the sweep, of those before
-        self._error, self._errors = np.nan, deque[float](maxlen=USUAL_OF)  # mean of inliers, likewise
+        self._sample_m, self._is_empty, self.latest = sample_m * voxel_m, True, _Latest()
+        self._shares, self._errors = deque[float](maxlen=USUAL_OF), deque[float](maxlen=USUAL_OF)  # of those before
         self._levels = [(size * voxel_m, small_gicp.GaussianVoxelMap(size * voxel_m)) for size in levels]
         for _, voxels in self._levels:
             voxels.set_lru(horizon=SWEEPS_KEPT)
@@ -199,10 +226,10 @@ class _Map:
         guess and None where it could not be aligned. `surprise` is minus the log-likelihood of a pose, with its
         information, by what is known of the motion; it counts where there are several guesses.
         """
-        self._sweep, self._share = self._thinned(points) if len(points) >= MIN_POINTS else None, np.nan
-        if self._sweep is None or self._sweep.size() < MIN_POINTS or self._is_empty:
+        self.latest = self._thinned(points) if len(points) >= MIN_POINTS else _Latest(spurious=self.latest.spurious)
+        if self.latest.sweep is None or self.latest.sweep.size() < MIN_POINTS or self._is_empty:
             return guesses[0], None
-        count = self._sweep.size()
+        count = self.latest.sweep.size()
         found = [self._aligned(self._levels[-1], guess) for guess in guesses]
         if len(found) > 1 or not found[0].num_inliers >= AS_USUAL * count * _usual(self._shares):
             found += [self._aligned(self._levels[-1], self._coarse(guess)) for guess in guesses]
@@ -220,21 +247,21 @@ class _Map:
             return float(by_points + surprise(one.T_target_source, self._information(one, max(least, usual))))
 
         best = min(held, key=cost)
-        self._share, self._error = best.num_inliers / count, best.error / best.num_inliers
+        self.latest = self.latest._replace(share=best.num_inliers / count, error=best.error / best.num_inliers)
         return np.asarray(best.T_target_source), self._information(best, least)
 
     def _information(self, aligned: Any, error: float) -> Floats:
         """The information (6, 6) of an alignment whose points have this mean error."""
-        return _without_spurious(np.asarray(aligned.H) / (SHARED_ERRORS**2 * error), self._spurious)
+        return _without_spurious(np.asarray(aligned.H) / (SHARED_ERRORS**2 * error), self.latest.spurious)
 
     def share_at(self, pose: Floats) -> float:
         """The share of the points of the sweep aligned last that lie on the map, from this pose."""
-        assert self._sweep is not None
+        assert self.latest.sweep is not None
         size_m, voxels = self._levels[-1]
         found = small_gicp.align(
-            voxels, self._sweep, pose, max_correspondence_distance=ON_MAP * size_m, max_iterations=1
+            voxels, self.latest.sweep, pose, max_correspondence_distance=ON_MAP * size_m, max_iterations=1
         )
-        return float(found.num_inliers / self._sweep.size())
+        return float(found.num_inliers / self.latest.sweep.size())
 
     def _coarse(self, guess: Floats) -> Floats:
         for level in self._levels[:-1]:
@@ -246,7 +273,7 @@ class _Map:
         size_m, voxels = level
         return small_gicp.align(
             voxels,
-            self._sweep,
+            self.latest.sweep,
             guess,
             max_correspondence_distance=LOOK_M * size_m,
             max_iterations=MOST_ITERATIONS,
@@ -254,17 +281,18 @@ class _Map:
 
     def insert(self, pose: Floats) -> None:
         """The sweep aligned last joins the map."""
-        if self._sweep is None:
+        if self.latest.sweep is None:
             return
-        if np.isfinite(self._share):
-            self._shares.append(self._share)
-            self._errors.append(self._error)
+        if np.isfinite(self.latest.share):
+            self._shares.append(self.latest.share)
+            self._errors.append(self.latest.error)
         for _, voxels in self._levels:
-            voxels.insert(self._sweep, pose)
+            voxels.insert(self.latest.sweep, pose)
         self._is_empty = False
 
-    def _thinned(self, points: Floats) -> Any:
+    def _thinned(self, points: Floats) -> _Latest:
         """One point per voxel with its covariance, without those whose neighbours lie on a line."""
+        spurious = self.latest.spurious
         sweep = small_gicp.voxelgrid_sampling(points, self._sample_m)
         sampled = np.asarray(sweep.points())[:, :3]
         if len(sampled) > NEIGHBOURS:
@@ -274,9 +302,9 @@ class _Map:
             is_flat = second > FLATTEST * most
             if is_flat.sum() > NEIGHBOURS:
                 sweep = small_gicp.PointCloud(sampled[is_flat])
-                self._spurious = _noise_of_normals(scatter[is_flat], least[is_flat], second[is_flat], most[is_flat])
+                spurious = _noise_of_normals(scatter[is_flat], least[is_flat], second[is_flat], most[is_flat])
         small_gicp.estimate_covariances(sweep, None, NEIGHBOURS)
-        return sweep
+        return _Latest(sweep, spurious=spurious)
 
 
 def _without_spurious(information: Floats, spurious: Floats) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -32,6 +32,8 @@ SLACK = 0.1
 LEAST_TURNS, MOST_TURNS = 0.5, 1.5
 """Revolutions of a sweep: a planar scanner sees 0.7, some drivers cut after 1.1; ring after ring there are as many as
 rings, row after row of a camera's image none."""
+READS_KEPT = 3
+"""Sweeps kept as read, of two key frames in a row: one, and the last lent to the other; and one to come."""
 
 
 def deskewed(cloud: PointCloud, velocity: Floats, after_s: float = 0.0) -> PointCloud:
@@ -118,10 +120,16 @@ def joined_frame(frame: Frame, others: Sequence[Frame], frame_from_other: Floats
     return replace(frame, read_points=partial(_read_joined, frame.read_points, reads, frame_from_other, options))
 
 
+@lru_cache(maxsize=READS_KEPT)
+def _read_once(read: Callable[[], PointCloud]) -> PointCloud:
+    """The sweep, which the key frames before and after it are lent too."""
+    return read()
+
+
 def _read_joined(
     read: Callable[[], PointCloud], reads: list[Callable[[], PointCloud]], motions: Floats, options: CloudOptions
 ) -> PointCloud:
-    own, whole = read(), [one() for one in reads]
+    own, whole = _read_once(read), [_read_once(one) for one in reads]
     others = [in_range(one, options) for one in whole]
     no_returns = sum(one.no_numbers + int((~one.points_in_cam.any(axis=1)).sum()) for one in whole)
     moved = [
