@@ -9,7 +9,6 @@ import pytest
 from hodge_adapters.tum.reader import READOUT_S, TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
-from hodge_pipeline.registration.odometry import Odometry
 from hodge_pipeline.registration.pixels import back_project, project
 from hodge_pipeline.registration.tracking.flow import Corners, FlowImage, find_corners, flow_image, follow
 from hodge_pipeline.registration.tracking.readout import estimate_readout, with_readout
@@ -23,12 +22,10 @@ from hodge_pipeline.store import artifacts
 from hodge_pipeline.types import (
     Camera,
     CloudSet,
-    Edges,
     Floats,
     Frame,
     Landmarks,
     PointCloud,
-    Registration,
     Source,
 )
 from hodge_pipeline.types.notes import Note
@@ -294,14 +291,13 @@ def test_landmarks_of_frames_registered_whole_are_moved_by_the_read_out_that_the
         clouds.append(PointCloud(points, landmarks=Landmarks(points, descriptors, pixel_rad)))
     CloudSet.from_clouds(clouds).save(tmp_path / "made")
     pairs = np.stack([np.arange(13), np.arange(1, 14)], axis=1)
-    motions = se3.between(poses, pairs)
-    steps = [Registration(motion, np.eye(6), 1.0, 0.0, 80, 1, True, by_landmarks=True) for motion in motions]
-    found = Odometry(poses, Edges.of(pairs, "sequential").with_registrations(steps), ())
+    twists = velocities(poses, times, np.zeros(14, np.int64), np.ones(14, bool))
     frames = tuple(Frame(row, time_s, camera=ROLLING) for row, time_s in enumerate(times.tolist()))
     source, notes = Source("shaken", tmp_path, frames), list[Note]()
     (tmp_path / "clouds").mkdir()  # of a run that was killed
     made = CloudSet.open(tmp_path / "made")
-    moved = at_stamps(source, made, found, 1.0, step=Step(tmp_path, no_progress, lambda *told: notes.extend(told)))
+    step = Step(tmp_path, no_progress, lambda *told: notes.extend(told))
+    moved = at_stamps(source, made, poses, twists, pairs, 1.0, step=step)
     assert [note.kind for note in notes] == (["other readout"] if real_s < 0 else [])
     true = np.concatenate([se3.transform(se3.inverse(pose), world) for pose in poses])
     before_m, after_m = (float(np.median(np.linalg.norm(one.mark_points - true, axis=1))) for one in (made, moved))

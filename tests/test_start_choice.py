@@ -16,6 +16,7 @@ from hodge_pipeline.scene import KeyFrames, Round, Scene
 from hodge_pipeline.sources.opening import fingerprints, remembered
 from hodge_pipeline.start import odometry as odometry_start
 from hodge_pipeline.start.clouds import make_clouds
+from hodge_pipeline.start.given import GivenStart
 from hodge_pipeline.start.odometry import OdometryStart
 from hodge_pipeline.start.unordered.join import _keeps_odometry
 from hodge_pipeline.start.unordered.start import Start
@@ -96,9 +97,11 @@ def test_landmarks_are_made_where_parts_are_joined_alone(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("apart_s", "readout_s", "moved"), [(0.22, 0.02, True), (0.22, 0.0, False), (1.0, 0.02, False)]
+    ("given", "apart_s", "readout_s", "moved"),
+    [(False, 0.22, 0.02, True), (False, 0.22, 0.0, False), (False, 1.0, 0.02, False), (True, 0.22, 0.02, True)],
 )
 def test_landmarks_of_frames_registered_whole_are_of_the_moment_of_their_stamps(
+    given: bool,
     apart_s: float,
     readout_s: float,
     moved: bool,
@@ -119,7 +122,8 @@ def test_landmarks_of_frames_registered_whole_are_of_the_moment_of_their_stamps(
     )
     source = remembered(replace(opened, frames=frames), reader, steps, fingerprints(opened.files))
     made = make_clouds(source, recipe.clouds, steps, InProcess())
-    scene = recipe.start.begin(source, recipe.clouds, steps, InProcess())
+    start = GivenStart(every=1) if given else recipe.start
+    scene = start.begin(source, recipe.clouds, steps, InProcess())
     assert scene.key_frames.are_all and len(made.mark_points) > 20
     np.testing.assert_array_equal(scene.clouds.points, made.points)
     change_m = np.linalg.norm(scene.clouds.mark_points - made.mark_points, axis=1)

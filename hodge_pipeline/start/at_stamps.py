@@ -1,4 +1,4 @@
-"""The step that moves landmarks to where they were at the stamps of their frames, by the velocities of odometry."""
+"""The step that moves landmarks to where they were at the stamps of their frames, by the velocities of the camera."""
 
 from __future__ import annotations
 
@@ -6,14 +6,12 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.registration.descriptors import LOWE_RATIO, match, root_sift
-from hodge_pipeline.registration.odometry import Odometry
 from hodge_pipeline.registration.pixels import project
 from hodge_pipeline.registration.tracking.readout import MOST_VIEWS, Readout, estimate_readout, with_readout
-from hodge_pipeline.registration.tracking.shutter import at_frame_stamp, velocities
+from hodge_pipeline.registration.tracking.shutter import at_frame_stamp
 from hodge_pipeline.registration.tracking.sightings import View
-from hodge_pipeline.scene import has_real_stamps, stamps_of
+from hodge_pipeline.scene import has_real_stamps
 from hodge_pipeline.stages import Step, Steps
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.codec import CLOUDS
@@ -22,28 +20,34 @@ from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.notes import Note
 
 
-def with_landmarks_at_stamps(source: Source, made: CloudSet, found: Odometry, unit_m: float, steps: Steps) -> CloudSet:
-    """The clouds of all frames, their landmarks moved to where they were at the stamps of the frames, by the velocities
-    of odometry. As they are without a clock, or where all pixels are of the moment of the stamp.
+def with_landmarks_at_stamps(
+    source: Source, made: CloudSet, world_from_cam: Floats, twists: Floats, pairs: Ints, unit_m: float, steps: Steps
+) -> CloudSet:
+    """The clouds of all frames (N), their landmarks moved to where they were at the stamps of the frames, by the
+    velocities `twists (N, 6)`. As they are without a clock, or where all pixels are of the moment of the stamp.
     """
     late = any(frame.colour_delay_s or (frame.camera and frame.camera.readout_s) for frame in source.frames)
     if not late or not len(made.mark_points) or not has_real_stamps(source.frames):
         return made
-    return steps.step(at_stamps, source, made, found, unit_m, title="landmarks at the stamps of frames")
+    title = "landmarks at the stamps of frames"
+    return steps.step(at_stamps, source, made, world_from_cam, twists, pairs, unit_m, title=title)
 
 
-def at_stamps(source: Source, made: CloudSet, found: Odometry, unit_m: float, *, step: Step) -> CloudSet:
-    """Step: the clouds (N), their landmarks moved, by their camera's read-out unless they surely fit another; all other
-    files are linked, not copied. `unit_m`: length units per metre.
+def at_stamps(
+    source: Source, made: CloudSet, world_from_cam: Floats, twists: Floats, pairs: Ints, unit_m: float, *, step: Step
+) -> CloudSet:
+    """Step: the clouds (N), their landmarks moved, by their camera's read-out unless those of `pairs (P, 2)` surely fit
+    another; all other files are linked, not copied.
+
+    `world_from_cam (N, 4, 4)`: where the fit starts; `twists (N, 6)`: see `shutter.velocities`; `unit_m`: length units
+    per metre.
     """
-    poses, frames, readout = found.world_from_cam, source.frames, None
-    piece = connected_components(found.steps.pairs, len(made))
-    twists = velocities(poses, stamps_of(source), piece, np.ones(len(made), bool))
+    frames, readout = source.frames, None
     if any(frame.camera and frame.camera.readout_s for frame in frames):
-        moves, pairs = np.asarray(twists.any(axis=1)), found.steps.pairs[found.steps.by_landmarks]
+        moves = np.asarray(twists.any(axis=1))
         pairs = pairs[moves[pairs].all(axis=1)]
         views = landmark_views(made, frames, pairs[evenly(len(pairs), MOST_VIEWS)])
-        readout = estimate_readout(views, frames, poses, twists, unit_m)
+        readout = estimate_readout(views, frames, world_from_cam, twists, unit_m)
     if readout is not None:
         step.note(other_readout(readout))
     folder = step.folder / CLOUDS

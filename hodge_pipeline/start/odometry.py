@@ -10,11 +10,13 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.pairs.revisits import Revisits, find_revisits
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import Odometry, OdometryOptions, odometry
 from hodge_pipeline.registration.odometry_path import drift_of
-from hodge_pipeline.scene import START, Closed, KeyFrames, Round, Scene, key_source, sequences_of, vertex_ids
+from hodge_pipeline.registration.tracking.shutter import velocities
+from hodge_pipeline.scene import START, Closed, KeyFrames, Round, Scene, key_source, sequences_of, stamps_of, vertex_ids
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import Step, Steps, Workers
 from hodge_pipeline.start.at_stamps import with_landmarks_at_stamps
@@ -60,7 +62,10 @@ class OdometryStart(OdometryOptions):
             chain, made, sequences, stamps, clouds.unit_m, self.odometry,
             title="odometry", total=len(stamps), workers=workers,
         )  # fmt: skip
-        made = with_landmarks_at_stamps(source, made, found, clouds.unit_m, steps)
+        poses, pairs = found.world_from_cam, found.steps.pairs
+        twists = velocities(poses, stamps_of(source), connected_components(pairs, len(made)), np.ones(len(made), bool))
+        pairs = pairs[found.steps.by_landmarks]
+        made = with_landmarks_at_stamps(source, made, poses, twists, pairs, clouds.unit_m, steps)
         key_frames = KeyFrames.all_of(source, found.world_from_cam)
         return self.joined(source, made, clouds, found, key_frames, steps, workers)
 
