@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hodge_pipeline import se3
 from hodge_pipeline.registration.descriptors import match, root_sift
 from hodge_pipeline.registration.landmarks import find_landmarks
-from hodge_pipeline.registration.pixels import back_project, project, sound_depth
+from hodge_pipeline.registration.pixels import back_project, depth_sigma, project, sound_depth
 from hodge_pipeline.registration.rgbd import Rgbd, guided_match
 from hodge_pipeline.registration.visual import VisualMotion, fit_triples, visual_motion
 from hodge_pipeline.types import Bytes, Camera, CloudSet, Floats, Floats32, Frame, Landmarks, PointCloud
@@ -56,6 +56,24 @@ def test_two_thirds_of_wrong_matches_are_outvoted_and_the_error_has_the_size_tha
         assert np.linalg.norm(error[3:]) < 0.02
         squares.append(error @ found.information @ error / 6)
     assert 0.2 < np.mean(squares) < 5
+
+
+def test_depth_errors_that_neighbours_share_hardly_bend_the_motion():
+    """Pixel errors are each landmark's own; those of a depth camera are bumps that many share, so they weigh less."""
+    squares = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        points_j, measured = points_before(100, rng), []
+        for points in (se3.transform(I_FROM_J, points_j), points_j):
+            seen = project(points, CAMERA)
+            bumps = 1.5 * np.sin(2 * np.pi * (seen[:, :2] / [CAMERA.width, CAMERA.height] @ rng.normal(0, 1, 2)))
+            seen[:, :2] += rng.normal(0, 0.3, (100, 2))
+            seen[:, 2] += depth_sigma(seen[:, 2]) * (rng.normal(0, 1, 100) + bumps)
+            measured.append(back_project(seen, CAMERA))
+        found = motion_of(measured[0], measured[1])
+        assert found is not None
+        squares.append(float(np.sum((found.i_from_j[:3, 3] - I_FROM_J[:3, 3]) ** 2)))
+    assert np.sqrt(np.mean(squares)) < 0.002  # 1.7 mm; 2.3 with a pixel's sigma half as large again
 
 
 def test_landmarks_that_agree_on_nothing_give_no_motion_that_counts():

@@ -7,7 +7,7 @@ import numpy as np
 from hodge_pipeline.types import Bools, Camera, Floats, Floats32, Ints
 
 PIXEL_SIGMA = 0.75
-"""Pixels: the error of a feature, once the shutter's is taken out, and of a corner that flow followed, on TUM fr1."""
+"""Pixels: the error of a corner that flow followed, once the shutter's is taken out, on TUM fr1."""
 DEPTH_SIGMAS = 2.0
 """Factor on `depth_sigma`, the noise of one pixel on a plane: features and corners lie where depth is worst."""
 EDGE_STEP = 0.03
