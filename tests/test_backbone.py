@@ -340,7 +340,7 @@ def test_right_places_that_are_registered_wrong_do_not_widen_the_errors_of_all_l
         dimension=2,
     )
     backbone = find_backbone(spoiled)
-    assert backbone is not None and not backbone.doubted and backbone.used[: graph.edge_count].all()
+    assert backbone is not None and not backbone.doubted and (~backbone.used[: graph.edge_count]).sum() <= 1
     assert backbone.used[graph.edge_count :].mean() < 0.02
     assert made.error_m(backbone.world_from_cam) < 0.3 * made.error_m(made.odometry())
 

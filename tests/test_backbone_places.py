@@ -85,6 +85,19 @@ def test_a_second_lap_over_the_first_says_more_than_one_mistaken_corridor(seed: 
     assert made.error_m(found.world_from_cam) < 1.0 < 30 < made.error_m(made.odometry())
 
 
+@pytest.mark.parametrize(("bias", "wrong"), [(0.01, 0.2), (0.003, 0.0)])
+def test_a_short_lap_over_one_is_used_among_wrong_loops_and_by_stated_errors_far_too_large(
+    bias: float, wrong: float
+) -> None:
+    """One corridor, in which each place counts where unused loops agree with no other, and all loops look random by
+    errors of 5 m and .2 rad a step. None was used.
+    """
+    made = two_laps(1, lap=100, bias=bias, wrong=wrong)
+    found = diagnose(made.graph)
+    assert found.kept[made.right].all() and not (found.kept & ~made.right).any()
+    assert made.error_m(found.world_from_cam) < 0.1 * made.error_m(made.odometry())
+
+
 def test_many_right_places_are_not_outnumbered_by_wrong_loops(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 2000 right ones over 80,000 steps 3 were used, after 320 CPU s: each alone says little beside 18,000."""
     met = list[tuple[Places, Linear]]()

@@ -181,7 +181,7 @@ def joined(chain: Chain) -> Chain:
     while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
         poses = chain.poses
         outliers = OutlierModel.of(chain, poses)
-        scales, shares = learned = learned or learn_scales(chain, outliers)
+        scales, shares = learned = learned or learn_scales(chain, outliers)[0]
         linear, rows = linearise(scales.applied(chain), poses), np.arange(len(chain.ends))
         covariance = by_path(linear, rows)
         log_wrong = outliers.at(linear.chain, rows, linear.loops[0]).log_density(covariance)

@@ -60,12 +60,17 @@ def infer(
     """The loops of a chain, judged; those of `trusted (M,)` are used in any case.
 
     `may_thin`: where the right loops leave more than `MOST_UNKNOWNS`, all are judged at the poses of some of them;
-    without it None comes back then. `scales`: of the errors; by default learned from the loops, and anew at the poses
-    that they lead to where the drift of a long path had hidden how loops err: where scales there differ much, other
-    loops agree by them, and the loops are likelier.
+    without it None comes back then. `scales`: of the errors; by default those learned from the loops by which these are
+    likelier, and learned anew at the poses that they lead to where the drift of a long path had hidden how loops err:
+    where scales there differ much, other loops agree by them, and the loops are likelier.
     """
-    given, shares = learn_scales(chain, outliers) if scales is None else (scales, EVEN)
-    found = _Trial.of(chain, outliers, trusted, may_thin, given, shares).found()
+    learned = learn_scales(chain, outliers) if scales is None else [(scales, EVEN)]
+    found: Inferred | None = None
+    for given in learned:
+        other = _Trial.of(chain, outliers, trusted, may_thin, *given).found()
+        if other is None:
+            return None
+        found = other if found is None or other.log_evidence > found.log_evidence else found
     for _ in range(MOST_LEARNED if scales is None else 0):
         if found is None or not found.confirmed:
             break

@@ -34,9 +34,10 @@ MOST_TRIED = 3
 """Places left out on trial each time: a limit on cost."""
 CLEARLY = float(np.log(20.0))
 """Log-odds that a change must gain."""
-FEW_UNUSED = 0.1
-"""Share of the loops that must be unused for the places of a corridor to count once; with fewer, each place counts.
-Looked at on a walk all of whose loops are right, and on graphs of which four fifths or half are wrong, not between.
+FEW_ALIKE = 0.1
+"""Share of the loops that must be unused and agree in groups of more than `PAIRED`, so that places do look alike, for
+the places of a corridor to count once; else each counts. Unused loops that agree with no other say nothing of
+corridors: counted too, a few random loops took all right ones from 10 of 90 short rings.
 """
 PAIRED = 2
 """Loops of one place that agree by chance at the most: three among thousands are rare."""
@@ -89,12 +90,12 @@ class Places:
         place = rows[one_of_each_place(ends[rows])]
         distance, nearest = cKDTree(ends[place]).query(ends, p=np.inf)
         loops = loops_at_place(ends[rows])[np.searchsorted(rows, place)]
+        groups = agreeing_groups(PairwiseConsistency.of(start, alone.log_wrong), np.flatnonzero(distance > 1.0))
         run = np.arange(len(place))
-        if len(used) - len(rows) > FEW_UNUSED * len(used):
+        if sum(len(group) for group in groups if len(group) > PAIRED) > FEW_ALIKE * len(used):
             run = corridors(ends[place])
         by_size = np.lexsort((-loops, run))
         first = by_size[np.unique(run[by_size], return_index=True)[1]]
-        groups = agreeing_groups(PairwiseConsistency.of(start, alone.log_wrong), np.flatnonzero(distance > 1.0))
         order = np.argsort(place[first])
         loop = place[first][order]
         return cls(

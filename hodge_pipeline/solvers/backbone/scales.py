@@ -30,6 +30,10 @@ FIRST, FINEST = np.log(4.0), np.log(2.0) / 2
 """First and last step of the search, in the logarithm of a scale."""
 MOST_RATIO = np.log(2.0)
 """Largest log-ratio of the scales of rotation and of translation, where information is stated."""
+SMALLER = np.log(4.0) * np.array([0, -1, -2])
+"""Logarithms of common scales; another search begins at the likeliest. By stated errors far too large right loops say
+no more than chance does, and no change of one scale alone makes them likelier.
+"""
 UNITS, TRIED = np.log(4.0) * np.array([-8, -7, -6, -5, -4, -3, -2, 2, 3, 4, 5, 6, 7, 8]), 3
 """Further starts of the search, logarithms of a common scale, and how many of these, the likeliest, are searched. From
 them the scales of rotation and translation are independent where the information is the identity, for unknown.
@@ -120,9 +124,9 @@ class Scales:
         return step, loop
 
 
-def learn_scales(chain: Chain, outliers: OutlierModel) -> tuple[Scales, Floats]:
+def learn_scales(chain: Chain, outliers: OutlierModel) -> list[tuple[Scales, Floats]]:
     """The most probable scales given the loops' residuals against the bare chain, and the shares (2,) of right and
-    wrong loops.
+    wrong loops; and those from smaller scales on, where they differ much: the solutions have to tell.
 
     Loops count as independent: correlated errors of loops at one place, and of steps, would else pass for small errors.
     The log-likelihood of decoys, motions of loops between other places, is that of chance at each scale, and is
@@ -160,8 +164,11 @@ def learn_scales(chain: Chain, outliers: OutlierModel) -> tuple[Scales, Floats]:
     others = [_likeliest(value, unit) for unit in units[tried].tolist()]
     other = max(others, key=lambda each: each[1], default=found)
     found = other if other[1] > found[1] + LIKELIER_BY else found
-    logs = np.minimum(found[0], most)
-    return Scales(*map(float, np.exp(logs))), own.value(logs)[1]
+    smaller = _likeliest(value, 0.0, max(SMALLER, key=lambda log: value(np.full(4, log), 0.0)))
+    learned = []
+    for logs in (np.minimum(each[0], most) for each in (found, smaller)):
+        learned.append((Scales(*map(float, np.exp(logs))), own.value(logs)[1]))
+    return learned if learned[0][0].differ_much(learned[1][0]) else learned[:1]
 
 
 def _beyond_chance(logs: Floats, own: _Model, elsewhere: _Model) -> float:
@@ -197,9 +204,13 @@ def _upper_bounds(chain: Chain) -> Floats:
     return most
 
 
-def _likeliest(value: Callable[[Floats, float], float], unit: float) -> tuple[Floats, float]:
-    """The maximum of `value` by coordinate search from a common unit: the logarithms (4,) of scales, and the value."""
-    best, width = np.full(4, unit), FIRST
+def _likeliest(
+    value: Callable[[Floats, float], float], unit: float, start: float | None = None
+) -> tuple[Floats, float]:
+    """The maximum of `value` by coordinate search from a common scale `start`, by default the unit: the logarithms (4,)
+    of scales, and the value.
+    """
+    best, width = np.full(4, unit if start is None else start), FIRST
     top = value(best, unit)
     while width >= FINEST:
         axis = still = 0
