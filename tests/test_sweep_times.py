@@ -28,7 +28,8 @@ from hodge_pipeline.registration.sweeps import (
     velocities_along,
 )
 from hodge_pipeline.stages import Steps
-from hodge_pipeline.start.sweep_times import deskewed_along
+from hodge_pipeline.start.sweep_reading import Look
+from hodge_pipeline.start.sweep_times import deskewed_along, times_along
 from hodge_pipeline.types import Floats, PointCloud, Source
 from hodge_pipeline.types.notes import Note
 from hodge_pipeline.uses.trajectory import refine_trajectory
@@ -51,6 +52,8 @@ from street_sweeps import (
     warmed_up_once,
     without_order,
 )
+
+FAST, FAST_M_S = 24, 20.0
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -79,14 +82,15 @@ def test_sweeps_of_given_poses_are_deskewed_by_them() -> None:
 def test_backward_times_of_sweeps_with_given_poses_are_turned_and_named() -> None:
     notes = list[Note]()
     steps = cast(Steps, SimpleNamespace(note=notes.append))
-    source = Source("sweeps", Path("sweeps"), tuple(changed(frame, turned) for frame in street()))
-    made = deskewed_along(source, true_poses(range(COUNT)), CloudOptions(max_range_m=FARTHEST_M), steps)
+    poses, right = Road(FAST_M_S).world_from_car(np.arange(FAST) * REVOLUTION_S), frames_of(fast_sweeps())
+    source = Source("sweeps", Path("sweeps"), tuple(changed(frame, turned) for frame in right))
+    made = deskewed_along(source, poses, CloudOptions(max_range_m=FARTHEST_M), steps)
     assert [note.kind for note in notes] == ["times backwards"]
-    got, own = made.frames[12].read_points, street()[12].read_points
+    got, own = made.frames[12].read_points, right[12].read_points
     assert got is not None and own is not None
-    here, behind = true_poses([12, 13])
-    right = deskewed(own(), se3.log(se3.inverse(here) @ behind) / REVOLUTION_S).points_in_cam
-    assert np.abs(got().points_in_cam - right).max() < 0.02 < np.abs(own().points_in_cam - right).max()
+    here, behind = poses[12:14]
+    exact = deskewed(own(), se3.log(se3.inverse(here) @ behind) / REVOLUTION_S).points_in_cam
+    assert np.abs(got().points_in_cam - exact).max() < 0.02 < np.abs(own().points_in_cam - exact).max()
 
 
 @pytest.mark.parametrize(("noise_m", "most_m"), [(0.0, 0.01), (0.005, 0.05), (0.1, 0.6)])
@@ -155,10 +159,15 @@ def test_a_turn_from_the_first_sweep_on_is_followed() -> None:
 
 
 @cache
+def fast_sweeps() -> list[object]:
+    """Revolutions along a street, fast."""
+    scanner = SpinningScanner(Road(FAST_M_S), 0, beams=16, columns=360, noise=1.0)
+    return [scanner.sweep(number) for number in range(FAST)]
+
+
 def fast_street() -> list[PointCloud]:
-    """Revolutions at 20 m/s."""
-    scanner = SpinningScanner(Road(20.0), 0, beams=16, columns=360, noise=1.0)
-    return [PointCloud(sweep.points, times_s=sweep.times_s) for sweep in map(scanner.sweep, range(12))]
+    """The first half of these."""
+    return [PointCloud(sweep.points, times_s=sweep.times_s) for sweep in fast_sweeps()[: FAST // 2]]
 
 
 def test_sweeps_that_leave_the_motion_loose_judge_no_times(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -198,6 +207,28 @@ def test_times_that_run_backwards_or_are_of_deskewed_points_are_told_by_the_poin
             assert following.sense_of_times(0.5, velocity, UNUSED, given) == sense
 
 
+@pytest.mark.parametrize(
+    ("judged", "sense"),
+    [([UNUSED, FORWARDS], FORWARDS), ([FORWARDS], FORWARDS), ([UNUSED, BACKWARDS], FORWARDS), ([UNUSED] * 2, UNUSED)],
+)
+def test_other_times_are_taken_only_where_the_two_fastest_parts_are_sure_of_the_same(
+    judged: list[int], sense: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames, times = 3 * street()[:20], np.arange(60) * REVOLUTION_S
+    velocity = np.outer(np.repeat([1.0, 3.0, 2.0], 20), [0, 0, 0, 1.0, 0, 0])
+    answers, asked = iter(judged), list[float]()
+
+    def judge(_: float, of: Floats, __: int, sweeps: Sweeping, *___: object) -> int:
+        asked.append(of[3])
+        assert [at for _, at, _ in sweeps] == times[20 * (4 - int(of[3])) % 60 :][:20].tolist()
+        return next(answers)
+
+    monkeypatch.setattr(JUDGE, judge)
+    look = Look(50.0, REVOLUTION_S, 0.0)
+    assert times_along(frames, velocity, times, CloudOptions(max_range_m=FARTHEST_M), 0.5, look) == (0.0, sense)
+    assert asked == [3.0, 2.0][: len(judged)]
+
+
 def test_the_order_of_points_tells_how_a_scanner_spun_and_no_other_order_does() -> None:
     read = street()[3].read_points
     assert read is not None
@@ -231,7 +262,7 @@ def test_points_without_times_are_deskewed_by_their_order_where_the_map_is_sure_
 
     monkeypatch.setattr(JUDGE, sure)
     found, said = followed(frames)
-    assert judged == [(UNUSED, 20)]
+    assert judged == 2 * [(UNUSED, COUNT // 2)]
     assert "points of 24 of 24 sweeps have no times" in said and "their times are told by it" in said
     assert absolute_error(found.world_from_scan, true_poses(range(COUNT))).max_m < NEAR_M
     right, _ = street_followed()

@@ -22,6 +22,7 @@ from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.registration import scan_to_map
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.scan_to_map import ScanToMap
+from hodge_pipeline.registration.scan_to_map import Step as Placed
 from hodge_pipeline.registration.sweeps import (
     deskewed,
     deskewed_frame,
@@ -126,6 +127,23 @@ def test_a_turn_on_the_spot_that_ends_within_a_sweep_goes_no_further() -> None:
     off = se3.log(se3.inverse(se3.inverse(exact[0]) @ exact[-1]) @ tracker.pose)
     assert np.degrees(np.linalg.norm(off[:3])) < 1.0  # 6.6, where it is deskewed by the turn alone
     assert np.linalg.norm(off[3:]) < 0.05
+
+
+def test_a_velocity_beyond_those_of_sweeps_that_held_goes_back_where_the_alignment_tells_less() -> None:
+    """As along like panels of a corridor, where an office of 900 sweeps slid by half a metre a sweep."""
+    tracker, ahead, few = ScanToMap(0.2, np.zeros(6)), np.eye(6)[3], PointCloud(np.ones((1, 3), np.float32))
+
+    def after(velocity: Floats, weak: Floats) -> Floats:
+        tracker.accept(Placed(np.eye(4), 0.0, velocity, np.eye(3), 0.1, False, 1.0, weak))
+        return tracker.place(few, REVOLUTION_S).velocity
+
+    for speed in (1.0, 2.0) * 5:
+        after(speed * ahead, np.zeros((3, 3)))
+    beyond, along = 6.0 * ahead + np.eye(6)[4], np.diag([1.0, 0, 0])
+    np.testing.assert_array_equal(after(1.5 * ahead, along), 1.5 * ahead)
+    _, _, _, forwards, left, _ = after(beyond, along)
+    assert 4.5 < forwards < 5.5 and left == 1.0
+    np.testing.assert_array_equal(after(beyond, np.zeros((3, 3))), beyond)
 
 
 def test_a_sweep_off_the_even_motion_around_it_is_named() -> None:

@@ -14,10 +14,10 @@ from hodge_pipeline.types import Floats, PointCloud
 
 MOST_PASSES = 4
 """Passes over the first sweeps, forwards and backwards, for their velocity, at most."""
-SURE, FEWEST_TIMED = 4.0, 10
+SURE, FEWEST_TIMED = 2.5, 10
 """Standard errors by which more points lie on the map by other times than those told, over as many sweeps and more,
-before these are taken. Times by the order of points reach 9.5 in 28 simulated sequences as measured, 0.2 in the same
-deskewed before.
+before these are taken, where another part of the sequence says the same. Of 37 parts of streets with right times one is
+above it, at 4.2; they lie about -2.0 with a standard deviation of 2.2, so that two of a sequence are in one of 1,800.
 """
 NO_MAP = 2
 """Sweeps at the beginning that have no map of sweeps placed yet."""

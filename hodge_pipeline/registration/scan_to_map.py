@@ -49,6 +49,11 @@ ON_MAP = 0.5
 """Finest voxels from a Gaussian of the map within which a point lies on it."""
 ACCELERATION_M_S2, FASTEST_M_S = 5.0, 30.0
 """Sigmas of the motion model: of acceleration, as of a car that brakes hard, and of an unknown velocity."""
+HELD_OF, UNUSUAL_M_S = 100, 1.0
+"""Sweeps, of those whose alignment told more of the way than the motion so far in every direction, that tell how fast
+the scanner goes. Along what the last one told less of, a velocity beyond theirs is expected to be so by their largest
+speed, at one sigma, and by a slow walk of those at rest: an alignment in a corridor of like panels agrees with any.
+"""
 UNKNOWN: Floats = FASTEST_M_S**2 * np.eye(3)
 """Covariance (3, 3) of an unknown velocity, (m/s)²."""
 SHARED_ERRORS = 30.0
@@ -62,7 +67,8 @@ MOST_DESKEWS, FARTHER = 3, 0.9
 class Step(NamedTuple):
     """A sweep placed in the map, not yet part of it: `pose` at its middle, `time_s` at which it began, its velocity
     (6,) with the covariance (3, 3) of the translation; the share of its points on the map, NaN where it could not be
-    aligned; see `ScanToMap` for the others.
+    aligned; `weak` (3, 3) projects on the directions of which the alignment told less than the motion so far; see
+    `ScanToMap` for the others.
     """
 
     pose: Floats
@@ -72,6 +78,7 @@ class Step(NamedTuple):
     turn_s: float
     is_loose: bool
     on_map: float
+    weak: Floats
 
 
 class ScanToMap:
@@ -98,6 +105,7 @@ class ScanToMap:
         self.spread = spread  # covariance of the velocity, (m/s)^2
         self._time_s: float | None = None
         self._usual = deque[float](maxlen=USUAL_OF)
+        self._held, self._weak = deque[Floats](maxlen=HELD_OF), np.zeros((3, 3))
 
     def follow(self, cloud: PointCloud, time_s: float) -> None:
         """Find the pose of a sweep that began at `time_s`, which is earlier than the last one's on the way back."""
@@ -114,6 +122,9 @@ class ScanToMap:
         self.turn_s, self.is_loose = step.turn_s, step.is_loose
         if np.isfinite(step.on_map):
             self._usual.append(step.on_map)
+            self._weak = step.weak
+            if not step.weak.any():
+                self._held.append(step.velocity[3:])
 
     def place(self, cloud: PointCloud, time_s: float) -> Step:
         """The sweep that began at `time_s` in the map of those before.
@@ -135,9 +146,9 @@ class ScanToMap:
         """The sweep placed, expected to move with this velocity (6,)."""
         turn_s = 0.0 if cloud.times_s is None else float(cloud.times_s.max())
         duration = 0.0 if self._time_s is None else time_s - self._time_s
-        before, rates = self.pose, [velocity]
-        predicted, spread = before @ se3.exp(velocity * duration), self.spread
-        moved_spread = spread = spread + (ACCELERATION_M_S2 * duration) ** 2 * np.eye(3)
+        velocity, spread = self._expected(velocity, self.spread + (ACCELERATION_M_S2 * duration) ** 2 * np.eye(3))
+        before, rates, moved_spread, weak = self.pose, [velocity], spread, np.zeros((3, 3))
+        predicted = before @ se3.exp(velocity * duration)
         far_m = _far_m(cloud.points_in_cam)
         for _ in range(MOST_DESKEWS):
             points = deskewed(cloud, rates[-1], turn_s / 2).points_in_cam.astype(np.float64)
@@ -149,7 +160,8 @@ class ScanToMap:
             is_loose = information is None and self._time_s is not None
             if information is None or not duration:  # no velocity from two sweeps of one stamp
                 break
-            known = np.linalg.eigvalsh(information[3:, 3:])
+            known, axes = np.linalg.eigh(information[3:, 3:])
+            weak = axes * (known * (ACCELERATION_M_S2 * duration**2) ** 2 < 1) @ axes.T
             is_loose = bool(known[0] < LOOSE * known.sum())
             pose, moved = _kalman_update(predicted, moves_m2, pose, information)
             moved_spread = moved / duration**2
@@ -158,7 +170,21 @@ class ScanToMap:
             if not turn_s or _shift_m(rates[-1] - rates[-2], far_m, turn_s / 2) < self._voxel_m / 2:
                 break
         on_map = self._map.share_at(pose) if information is not None else np.nan
-        return Step(pose, time_s, velocity, moved_spread, turn_s, is_loose, on_map)
+        return Step(pose, time_s, velocity, moved_spread, turn_s, is_loose, on_map, weak)
+
+    def _expected(self, velocity: Floats, spread: Floats) -> tuple[Floats, Floats]:
+        """A velocity (6,) and the covariance (3, 3) of its translation, along weak directions drawn back to the
+        range of those of sweeps that held.
+        """
+        if len(self._held) < USUAL_OF:
+            return velocity, spread
+        held = np.array(self._held)
+        beyond = np.clip(velocity[3:], held.min(axis=0), held.max(axis=0)) - velocity[3:]
+        known = self._weak / (UNUSUAL_M_S**2 + np.square(held).sum(axis=1).max())
+        if not (known @ beyond).any():
+            return velocity, spread
+        spread = np.linalg.inv(np.linalg.inv(spread) + known)
+        return np.concatenate([velocity[:3], velocity[3:] + spread @ known @ beyond]), spread
 
 
 def _far_m(points: Floats32) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.following import sense_of_times
@@ -29,7 +28,7 @@ VOXELS_IN_REACH = 100
 SMALLEST_VOXEL_M = 0.08
 """Four times the usual noise of a range, 2 cm: smaller voxels, as in a room, would hold noise in place of surfaces."""
 WARM_UP = 20
-"""Sweeps that the first velocity is found on, and that times are judged by."""
+"""Sweeps that the first velocity is found on, and that times are judged by at a time."""
 AS_TOLD = 0.0, FORWARDS
 """How the times of points are read (`retimed_frame`) where nothing is sure to be better."""
 
@@ -88,18 +87,21 @@ def times_along(
     look: Look,
     advance: Advance = no_progress,
 ) -> tuple[float, int]:
-    """How the times of points are read (`retimed_frame`), by those `WARM_UP` sweeps in a row that skew moves farthest.
+    """How the times of points are read (`retimed_frame`): others than those told only where the map is sure of the same
+    ones in both of the two parts that skew moves farthest, of up to `WARM_UP` sweeps each.
 
-    Times by the order of points, and others than those told, are taken only where the map is sure of them: sweeps may
-    have been deskewed before.
+    The sweeps of a part share a map, and with it their errors: by one part of 33 right times were called deskewed.
     """
     if not look.turn_s or not len(frames):
         return AS_TOLD
     skew_m = np.abs(velocity) @ np.repeat([look.reach_m, 1.0], 3)
-    in_a_row = sliding_window_view(skew_m, min(WARM_UP, len(frames)))
-    first = int(np.argmax(np.median(in_a_row, axis=1)))
-    part = [retimed_frame(frame, look.revolution_s) for frame in frames[first : first + WARM_UP]]
-    sweeps = timed_sweeps(part, times[first:], clouds, look.reach_m)
-    told = UNUSED if look.revolution_s else FORWARDS
-    sense = sense_of_times(voxel_m, velocity[first], told, sweeps, advance)
-    return AS_TOLD if sense == told else (look.revolution_s, sense)
+    told, count = UNUSED if look.revolution_s else FORWARDS, min(WARM_UP, max(1, len(frames) // 2))
+    parts = skew_m[: len(frames) // count * count].reshape(-1, count)
+    senses = set[int]()
+    for first in count * np.argsort(-np.median(parts, axis=1), kind="stable")[:2]:
+        part = [retimed_frame(frame, look.revolution_s) for frame in frames[first : first + count]]
+        sweeps = timed_sweeps(part, times[first:], clouds, look.reach_m)
+        senses.add(sense_of_times(voxel_m, velocity[first], told, sweeps, advance))
+        if len(senses) > 1 or told in senses:
+            return AS_TOLD
+    return look.revolution_s, senses.pop()
