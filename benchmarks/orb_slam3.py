@@ -89,7 +89,7 @@ def tracked_by_orb_slam3(source: Source) -> tuple[Floats, int, float]:
         system.shutdown()
         cpu_s = time.process_time() - begin_cpu
         system.save_trajectory_tum(str(folder / "poses.tum"))
-        rows = np.loadtxt(folder / "poses.tum", ndmin=2)
+        rows = np.loadtxt(folder / "poses.tum", ndmin=2).reshape(-1, 8)  # none where it never began
     poses = np.full((len(frames), 4, 4), np.nan)
     place = np.abs(rows[:, :1] - stamps).argmin(axis=1)
     poses[place] = se3.from_quat_xyzw(rows[:, 1:4], rows[:, 4:8])

@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 from hodge_adapters.tum.reader import TumReader
+from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.executors.local import InProcess
 from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.odometry import Odometry
-from hodge_pipeline.scene import KeyFrames, Round, Scene
+from hodge_pipeline.scene import KeyFrames, Round, Scene, sequences_of
 from hodge_pipeline.sources.opening import fingerprints, remembered
+from hodge_pipeline.start import given
 from hodge_pipeline.start import odometry as odometry_start
 from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.given import GivenStart
@@ -97,11 +99,11 @@ def test_landmarks_are_made_where_parts_are_joined_alone(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("given", "apart_s", "readout_s", "moved"),
+    ("is_given", "apart_s", "readout_s", "moved"),
     [(False, 0.22, 0.02, True), (False, 0.22, 0.0, False), (False, 1.0, 0.02, False), (True, 0.22, 0.02, True)],
 )
 def test_landmarks_of_frames_registered_whole_are_of_the_moment_of_their_stamps(
-    given: bool,
+    is_given: bool,
     apart_s: float,
     readout_s: float,
     moved: bool,
@@ -122,12 +124,27 @@ def test_landmarks_of_frames_registered_whole_are_of_the_moment_of_their_stamps(
     )
     source = remembered(replace(opened, frames=frames), reader, steps, fingerprints(opened.files))
     made = make_clouds(source, recipe.clouds, steps, InProcess())
-    start = GivenStart(every=1) if given else recipe.start
+    start = GivenStart(every=1) if is_given else recipe.start
     scene = start.begin(source, recipe.clouds, steps, InProcess())
     assert scene.key_frames.are_all and len(made.mark_points) > 20
     np.testing.assert_array_equal(scene.clouds.points, made.points)
     change_m = np.linalg.norm(scene.clouds.mark_points - made.mark_points, axis=1)
     assert (float(np.median(change_m)) > 1e-4) == moved, "over a second a hand turns back: no velocity"
+
+
+@pytest.mark.parametrize(("unit", "jump_m", "fastest_m_s"), [(1.0, 0.0, 0.3), (1.0, 0.3, 0.3), (1000.0, 0.0, 0.0)])
+def test_landmarks_take_no_velocity_from_jumps_of_given_poses_nor_from_those_of_another_unit(
+    unit: float, jump_m: float, fastest_m_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = np.arange(12)
+    source = Source("given", Path("given"), tuple(Frame(row, row / 30) for row in rows.tolist()))
+    way_m = np.stack([0.01 * rows + jump_m * (rows > 5), 0.002 * np.sin(rows), 0 * rows], axis=1)
+    poses, taken = se3.from_parts(np.eye(3), unit * way_m), list[Floats]()
+    monkeypatch.setattr(given, "with_landmarks_at_stamps", lambda *args: taken.append(args[3]))
+    jumps = GivenStart()._jumps(poses, list(sequences_of(source).values()))
+    given._at_stamps(source, source, rows, poses, jumps[:, 1], CloudSet.from_clouds([]), 1.0, Store(Path("unused")))
+    assert taken[0][:, 3] == pytest.approx(fastest_m_s)
+    assert len(jumps) == (11 if unit > 1 else jump_m > 0)
 
 
 def source_at(stamps_s: list[float]) -> Source:

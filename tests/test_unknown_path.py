@@ -118,13 +118,13 @@ def test_a_model_further_down_is_named(tmp_path: Path, ending: str) -> None:
             opened(tmp_path)
         with pytest.raises(SourceError, match=f"one file of a COLMAP model: give its folder {model}$"):
             opened(model / f"images.{ending}")
-    shutil.copytree(model, tmp_path / "text")
-    with pytest.raises(SourceError, match=f"holds some below: give {model}, {tmp_path / 'text'}$"):
-        ColmapModels().open_models(tmp_path)
         with pytest.raises(SourceError, match="no such file or folder"):
             opened(tmp_path / "nowhere")
         with pytest.raises(SourceError, match="no COLMAP model: give the folder with cameras.bin"):
             opened(Path(__file__).parent)
+    shutil.copytree(model, tmp_path / "text")
+    with pytest.raises(SourceError, match=f"holds some below: give {model}, {tmp_path / 'text'}$"):
+        ColmapModels().open_models(tmp_path)
 
 
 def test_of_a_graph_with_landmarks_the_poses_are_solved(tmp_path: Path) -> None:

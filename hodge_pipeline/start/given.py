@@ -98,31 +98,34 @@ class GivenStart:
             poses = self._bridged(source, matched, clouds, steps, workers)
         sequences = list(sequences_of(source).values())
         rows = choose_key_frames(poses, sequences, self.distance_m, self.angle_deg, self.every)
-        rows = np.union1d(rows, self._at_jumps(poses, sequences))
+        jumps = self._jumps(poses, sequences)
+        rows = np.union1d(rows, jumps.ravel())
         steps.note(Note("key frames", len(rows), str(len(source.frames))))
         whole = deskewed_along(without_given_poses(source, poses, rows), poses, clouds, steps)
         keys = replace(key_source(whole, rows), graph=None)
         steps.remember(keys, steps.key([source, rows, poses]) + "deskewed")
         steps.remember(whole, steps.key([source, poses]) + "deskewed")
         made = make_clouds(keys, clouds, steps, workers)
-        made = _at_stamps(source, keys, rows, poses, made, clouds.unit_m, steps)
+        made = _at_stamps(source, keys, rows, poses, jumps[:, 1], made, clouds.unit_m, steps)
         first = Round(Edges.of([]), vertex_ids(keys), poses[rows], name=START)
         key_frames = _key_frames(source, rows, poses, matched.frame_times)
         return Scene(whole, keys, key_frames, made, first, is_given=True, given=file)
 
-    def _at_jumps(self, poses: Floats, sequences: Sequence[Ints]) -> Ints:
-        """The rows at both ends of a step that differs from the steps before and after it, so that the correction of a
-        jump is not spread over the frames around it.
+    def _jumps(self, poses: Floats, sequences: Sequence[Ints]) -> Ints:
+        """The rows (J, 2) at both ends of each step that differs from the steps before and after it, of the first and
+        last from the one beside it: its correction is not spread over the frames around it, nor is its velocity theirs.
         """
-        found = [np.zeros(0, np.int64)]
+        most_m, most_deg = (JUMP_SHARE * (far or np.inf) for far in (self.distance_m, self.angle_deg))
+        found = [np.zeros((0, 2), np.int64)]
         for rows in sequences:
+            if len(rows) < 3:
+                continue
             steps = se3.inverse(poses[rows[:-1]]) @ poses[rows[1:]]
             change = se3.inverse(steps[:-1]) @ steps[1:]
             turned_deg = np.rad2deg(se3.rotation_angle(change))
-            moved_m = np.linalg.norm(change[:, :3, 3], axis=1)
-            unlike = (moved_m >= JUMP_SHARE * self.distance_m) | (turned_deg >= JUMP_SHARE * self.angle_deg)
-            jumps = unlike[:-1] & unlike[1:]
-            found += [rows[1:-2][jumps], rows[2:-1][jumps]]
+            unlike = (np.linalg.norm(change[:, :3, 3], axis=1) >= most_m) | (turned_deg >= most_deg)
+            is_jump = np.r_[unlike[0], unlike] & np.r_[unlike, unlike[-1]]
+            found.append(np.stack([rows[:-1], rows[1:]], axis=1)[is_jump])
         return np.concatenate(found)
 
     def _matched(self, source: Source, steps: Steps) -> tuple[Matched, GivenFile | None]:
@@ -172,15 +175,25 @@ class GivenStart:
 
 
 def _at_stamps(
-    source: Source, keys: Source, rows: Ints, poses: Floats, made: CloudSet, unit_m: float, steps: Steps
+    source: Source,
+    keys: Source,
+    rows: Ints,
+    poses: Floats,
+    jumped: Ints,
+    made: CloudSet,
+    unit_m: float,
+    steps: Steps,
 ) -> CloudSet:
-    """The clouds of the key frames `rows (K,)`, landmarks moved by the velocities that given poses (N, 4, 4) have.
+    """The clouds of the key frames `rows (K,)`, landmarks moved by the velocities that given poses (N, 4, 4) have
+    between jumps, the steps to the rows `jumped (J,)`: poses of another unit jump at every step.
 
     Those of a rough path serve: of fr1/rpy, which turns 60 degrees a second, poses that err by 10 mm and 0.5 degrees
     each tell its velocity to 6.
     """
     sequence = sequence_numbers(source)
-    twists = velocities(poses, stamps_of(source), sequence, np.ones(len(poses), bool))
+    is_jump = np.isin(np.arange(len(poses)), jumped)
+    smooth = len(poses) * sequence + np.cumsum(is_jump)
+    twists = velocities(poses, stamps_of(source), smooth, np.ones(len(poses), bool))
     first = np.flatnonzero(sequence[rows[1:]] == sequence[rows[:-1]])
     pairs = np.stack([first, first + 1], axis=1)
     return with_landmarks_at_stamps(keys, made, poses[rows], twists[rows], pairs, unit_m, steps)

@@ -29,7 +29,7 @@ def part_of_model(path: Path) -> str:
     """What to give instead of a file of COLMAP's, or of a model that lacks one; empty for any other."""
     if path.suffix == ".db" and path.is_file():
         return "a database of COLMAP's has matches, no poses: give the folder of a model, with --database for this one"
-    if path.stem in MODEL_FILES and path.suffix in (".bin", ".txt") and model_ending(path.parent):
+    if path.stem in MODEL_FILES and path.suffix in ENDINGS and model_ending(path.parent):
         return f"one file of a COLMAP model: give its folder {path.parent}"
     return next(filter(None, (_lacking(path / place) for place in MODEL_PLACES)), "")
 
@@ -134,6 +134,14 @@ def find_models(path: Path) -> list[Path]:
             return found
     single = find_model(path)
     return [single] if single else []
+
+
+def incomplete_models(path: Path, models: Sequence[Path]) -> list[str]:
+    """What each other numbered folder beside these models, which lie below a path, lacks to be one of them."""
+    if path in models or not models[0].name.isdecimal():
+        return []
+    beside = sorted(entry for entry in models[0].parent.iterdir() if entry.name.isdecimal() and entry not in models)
+    return list(filter(None, map(_lacking, beside)))
 
 
 def largest_model(folders: Sequence[Path]) -> tuple[Path, str]:

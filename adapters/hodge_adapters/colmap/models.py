@@ -14,7 +14,15 @@ from hodge_adapters.colmap.bundle import Refine
 from hodge_adapters.colmap.content import checked_content, read_model
 from hodge_adapters.colmap.database import database_names, has_verified_pairs
 from hodge_adapters.colmap.depth import sensor_depth
-from hodge_adapters.colmap.files import by_report, find_database, find_models, largest_model, model_ending, no_model
+from hodge_adapters.colmap.files import (
+    by_report,
+    find_database,
+    find_models,
+    incomplete_models,
+    largest_model,
+    model_ending,
+    no_model,
+)
 from hodge_adapters.colmap.priors import database_priors, table_priors
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.reader import ColmapReader
@@ -76,6 +84,7 @@ class ColmapModels:
             raise no_model(Path(source))
         largest, several = largest_model(folders)
         told = (f"{several}: those that tie are joined, the report shows the largest result",) if several else ()
+        told += tuple(f"left out: {lack}" for lack in incomplete_models(Path(source), folders))
         models = [self._open(folder, *read_model(folder)) for folder in folders]
         return [
             replace(model, notes=(*told, *model.notes)) if folder == largest else model
