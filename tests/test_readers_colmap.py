@@ -66,8 +66,10 @@ def test_edges_are_estimated_without_the_poses(tmp_path: Path, kind: str, model:
     fields = text[rows[0]].split()
     text[rows[0]] = " ".join([fields[0], "1 0 0 0 9 9 9", *fields[8:]])
     (tmp_path / "text/images.txt").write_text("\n".join(text))
-    again = ColmapReader(edges=kind, min_shared=20).open(tmp_path / "text")
-    np.testing.assert_array_equal(again.graph.i_from_j, source.graph.i_from_j)
+    again = ColmapReader(edges=kind, min_shared=20, scale=2.0).open(tmp_path / "text")
+    np.testing.assert_array_equal(again.graph.i_from_j, se3.rescaled(source.graph.i_from_j, 2.0))
+    in_metres = np.outer(unit := np.repeat([1.0, 0.5], 3), unit)
+    np.testing.assert_array_equal(again.graph.information, source.graph.information * in_metres)
 
 
 @pytest.mark.parametrize("model", sorted(set(pycolmap.CameraModelId.__members__) - {"EQUIRECTANGULAR", "INVALID"}))

@@ -141,7 +141,7 @@ def test_landmarks_take_no_velocity_from_jumps_of_given_poses_nor_from_those_of_
     way_m = np.stack([0.01 * rows + jump_m * (rows > 5), 0.002 * np.sin(rows), 0 * rows], axis=1)
     poses, taken = se3.from_parts(np.eye(3), unit * way_m), list[Floats]()
     monkeypatch.setattr(given, "with_landmarks_at_stamps", lambda *args: taken.append(args[3]))
-    jumps = GivenStart()._jumps(poses, list(sequences_of(source).values()))
+    jumps = GivenStart()._jumps(poses, list(sequences_of(source).values()), given.NO_VELOCITY_SHARE)
     given._at_stamps(source, source, rows, poses, jumps[:, 1], CloudSet.from_clouds([]), 1.0, Store(Path("unused")))
     assert taken[0][:, 3] == pytest.approx(fastest_m_s)
     assert len(jumps) == (11 if unit > 1 else jump_m > 0)

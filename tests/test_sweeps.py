@@ -146,6 +146,36 @@ def test_a_velocity_beyond_those_of_sweeps_that_held_goes_back_where_the_alignme
     np.testing.assert_array_equal(after(beyond, np.zeros((3, 3))), beyond)
 
 
+@pytest.mark.parametrize(("has_end", "weak"), [(False, np.diag([1.0, 0, 0])), (True, np.zeros((3, 3)))])
+def test_an_alignment_tells_less_than_the_motion_so_far_along_bare_walls_alone(has_end: bool, weak: Floats) -> None:
+    rng, tracker = np.random.default_rng(0), ScanToMap(0.2, np.zeros(6))
+
+    def corridor() -> PointCloud:
+        points = rng.uniform([-12, -1.5, -1.5], [12, 1.5, 1.5], (8000, 3))
+        first, side = 500 * has_end, rng.integers(0, 4, 8000)
+        points[np.arange(first, 8000), 1 + side[first:] % 2] = np.where(side[first:] < 2, -1.5, 1.5)
+        points[:first, 0] = 8.0
+        return PointCloud((points + rng.normal(0, 0.01, (8000, 3))).astype(np.float32))
+
+    for row in range(3):
+        tracker.follow(corridor(), row * REVOLUTION_S)
+    np.testing.assert_allclose(tracker.place(corridor(), 3 * REVOLUTION_S).weak, weak, atol=0.05)
+
+
+def test_a_sweep_that_turns_on_joins_the_map_as_it_was_aligned_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The trial without the turn, which fits worse here, leaves nothing behind."""
+    tracker = ScanToMap(0.2, np.array([0, 0, 1.0, 0, 0, 0]))
+    tracker._usual.extend(10 * [1.0])
+
+    def placed(_: PointCloud, __: float, velocity: Floats) -> Placed:
+        tracker._map.latest = tracker._map.latest._replace(share=float(velocity[2]))
+        return Placed(np.eye(4), 0.0, velocity, np.eye(3), 0.1, False, 0.5 + 0.1 * velocity[2], np.zeros((3, 3)))
+
+    monkeypatch.setattr(tracker, "_placed", placed)
+    assert tracker.place(PointCloud(np.zeros((0, 3), np.float32)), 0.0).on_map == 0.6
+    assert tracker._map.latest.share == 1.0
+
+
 def test_a_sweep_off_the_even_motion_around_it_is_named() -> None:
     frames, side = street().copy(), np.array([0, 0.4, 0], np.float32)
     frames[13] = changed(frames[13], lambda cloud: replace(cloud, points_in_cam=cloud.points_in_cam + side))
@@ -258,15 +288,19 @@ def test_sweeps_are_told_from_stations_and_fragments() -> None:
     timed = street()
     plain = [changed(frame, lambda cloud: replace(cloud, times_s=None)) for frame in timed]
     half = [changed(f, lambda c: PointCloud(c.points_in_cam[c.points_in_cam[:, 0] > 0])) for f in timed]
-    ahead = [changed(f, lambda c: PointCloud(looking_ahead(c.points_in_cam))) for f in plain]
-    for frames, recipe in ((timed, "lidar"), (plain, "lidar"), (half, "scans"), (plain[:5], "scans"), (ahead, "scans")):
+    narrow, wide = ([changed(f, partial(looking_ahead, half_deg=degrees)) for f in plain] for degrees in (30, 50))
+    scans = half, plain[:5], narrow, wide
+    for frames, recipe in [(timed, "lidar"), (plain, "lidar"), *((each, "scans") for each in scans)]:
         facts = {"frames": len(frames), "formats": [{"reader": "clouds"}], **frame_facts(frames, [])}
         assert next_command(Path("in"), facts, None) == f"hodge run {recipe} --source in --out runs/in"
 
 
-def looking_ahead(points: np.ndarray) -> np.ndarray:
-    """Points as a depth camera of 60 degrees sees them, z ahead: on all sides of its axis."""
-    return points * np.array([1, 1, 0], np.float32) + np.linalg.norm(points, axis=1)[:, None] * [0, 0, np.sqrt(3)]
+def looking_ahead(cloud: PointCloud, half_deg: float) -> PointCloud:
+    """The points as a depth camera of this field sees them, z ahead: on all sides of its axis, all over its image."""
+    points = cloud.points_in_cam
+    share = np.sqrt(np.random.default_rng(0).uniform(size=(len(points), 1)))
+    ahead = np.linalg.norm(points, axis=1)[:, None] / np.tan(np.deg2rad(half_deg)) * [0, 0, 1]
+    return PointCloud((share * points * [1, 1, 0] + ahead).astype(np.float32))
 
 
 def mirrored(cloud: PointCloud) -> PointCloud:

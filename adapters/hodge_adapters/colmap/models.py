@@ -83,8 +83,8 @@ class ColmapModels:
         if not folders:
             raise no_model(Path(source))
         largest, several = largest_model(folders)
-        told = (f"{several}: those that tie are joined, the report shows the largest result",) if several else ()
-        told += tuple(f"left out: {lack}" for lack in incomplete_models(Path(source), folders))
+        told = [f"{several}: those that tie are joined, the report shows the largest result"] if several else []
+        told += [f"left out: {lack}" for lack in incomplete_models(Path(source), folders)]
         models = [self._open(folder, *read_model(folder)) for folder in folders]
         return [
             replace(model, notes=(*told, *model.notes)) if folder == largest else model
