@@ -94,7 +94,7 @@ def peer_row(peer: str, recipe_name: str, path: Path, frames: int, overrides: li
     truth, count = true_poses(source), len(source.frames)
     poses, lost, cpu_s = PEERS[peer](source)
     note, cells = f", {lost} lost" if lost else "", "– | – | – | –"
-    if np.isfinite(truth).any():
+    if (np.isfinite(truth) & np.isfinite(poses)).any():
         error, moved = absolute_error(poses, truth), relative_error(poses, truth)
         cells = (
             f"{100 * error.rmse_m:.2f} | {100 * error.max_m:.1f} | {1e3 * moved.translation_rmse_m:.1f} | "
