@@ -164,11 +164,12 @@ def learn_scales(chain: Chain, outliers: OutlierModel) -> list[tuple[Scales, Flo
     others = [_likeliest(value, unit) for unit in units[tried].tolist()]
     other = max(others, key=lambda each: each[1], default=found)
     found = other if other[1] > found[1] + LIKELIER_BY else found
-    smaller = _likeliest(value, 0.0, max(SMALLER, key=lambda log: value(np.full(4, log), 0.0)))
+    start = max(SMALLER, key=lambda log: value(np.full(4, log), 0.0)) if chain.stated else 0.0
+    each = [found, _likeliest(value, 0.0, start)] if start else [found]
     learned = []
-    for logs in (np.minimum(each[0], most) for each in (found, smaller)):
+    for logs in (np.minimum(logs, most) for logs, _ in each):
         learned.append((Scales(*map(float, np.exp(logs))), own.value(logs)[1]))
-    return learned if learned[0][0].differ_much(learned[1][0]) else learned[:1]
+    return learned if learned[0][0].differ_much(learned[-1][0]) else learned[:1]
 
 
 def _beyond_chance(logs: Floats, own: _Model, elsewhere: _Model) -> float:
