@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.wrong_loops import simulated_cases
+from benchmarks.spoilt_graphs import simulated_cases
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions

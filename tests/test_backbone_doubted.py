@@ -9,7 +9,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from benchmarks.wrong_loops import lattice_cases
+from benchmarks.spoilt_graphs import lattice_cases
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.solvers.backbone import bridged, inference

@@ -26,7 +26,7 @@ from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.places import MISTAKEN_PLACES, MOST_STEPS, agreeing_groups
-from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales
+from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
 from hodge_pipeline.solvers.backbone.step_model import StepModel
 from hodge_pipeline.types import Bools, Ints
 
@@ -181,7 +181,7 @@ def joined(chain: Chain) -> Chain:
     while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
         poses = chain.poses
         outliers = OutlierModel.of(chain, poses)
-        scales, shares = learned = learned or learn_scales(chain, outliers)[0]
+        scales, shares = learned = learned or next(learned_scales(chain, outliers))
         linear, rows = linearise(scales.applied(chain), poses), np.arange(len(chain.ends))
         covariance = by_path(linear, rows)
         log_wrong = outliers.at(linear.chain, rows, linear.loops[0]).log_density(covariance)

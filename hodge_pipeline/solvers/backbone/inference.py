@@ -17,7 +17,7 @@ from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.places import MOST_STEPS, Places
 from hodge_pipeline.solvers.backbone.polish import polished
-from hodge_pipeline.solvers.backbone.scales import Scales, learn_scales
+from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
 from hodge_pipeline.types import Bools, Floats
 
 ROUNDS = 6
@@ -64,7 +64,7 @@ def infer(
     likelier, and learned anew at the poses that they lead to where the drift of a long path had hidden how loops err:
     where scales there differ much, other loops agree by them, and the loops are likelier.
     """
-    learned = learn_scales(chain, outliers) if scales is None else [(scales, EVEN)]
+    learned = learned_scales(chain, outliers) if scales is None else [(scales, EVEN)]
     found: Inferred | None = None
     for given in learned:
         other = _Trial.of(chain, outliers, trusted, may_thin, *given).found()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import astuple, dataclass, replace
 
 import numpy as np
@@ -99,7 +99,7 @@ class Scales:
     def at_solution(self, fit: Fit) -> Scales:
         """These scales, by which the fit was made, times how much larger residuals are there than they should be: the
         median of each kind, of runs of steps or loops, at poses solved without it. The same where these are few.
-        Not above the bounds of `learn_scales`: bent poses make errors of any size.
+        Not above the bounds of `learned_scales`: bent poses make errors of any size.
         """
         split, factors = fit.linear.chain.rotation_axes, np.ones(4)
         for kind, rows in enumerate((fit.reduced.of_runs, fit.reduced.of_loops)):
@@ -124,9 +124,9 @@ class Scales:
         return step, loop
 
 
-def learn_scales(chain: Chain, outliers: OutlierModel) -> list[tuple[Scales, Floats]]:
+def learned_scales(chain: Chain, outliers: OutlierModel) -> Iterator[tuple[Scales, Floats]]:
     """The most probable scales given the loops' residuals against the bare chain, and the shares (2,) of right and
-    wrong loops; and those from smaller scales on, where they differ much: the solutions have to tell.
+    wrong loops; then those that a search from smaller scales finds, where they differ much: the solutions have to tell.
 
     Loops count as independent: correlated errors of loops at one place, and of steps, would else pass for small errors.
     The log-likelihood of decoys, motions of loops between other places, is that of chance at each scale, and is
@@ -164,12 +164,16 @@ def learn_scales(chain: Chain, outliers: OutlierModel) -> list[tuple[Scales, Flo
     others = [_likeliest(value, unit) for unit in units[tried].tolist()]
     other = max(others, key=lambda each: each[1], default=found)
     found = other if other[1] > found[1] + LIKELIER_BY else found
+
+    def learned(logs: Floats) -> tuple[Scales, Floats]:
+        logs = np.minimum(logs, most)
+        return Scales(*map(float, np.exp(logs))), own.value(logs)[1]
+
+    first = learned(found[0])
+    yield first
     start = max(SMALLER, key=lambda log: value(np.full(4, log), 0.0)) if chain.stated else 0.0
-    each = [found, _likeliest(value, 0.0, start)] if start else [found]
-    learned = []
-    for logs in (np.minimum(logs, most) for logs, _ in each):
-        learned.append((Scales(*map(float, np.exp(logs))), own.value(logs)[1]))
-    return learned if learned[0][0].differ_much(learned[-1][0]) else learned[:1]
+    if start and (second := learned(_likeliest(value, 0.0, start)[0]))[0].differ_much(first[0]):
+        yield second
 
 
 def _beyond_chance(logs: Floats, own: _Model, elsewhere: _Model) -> float:
