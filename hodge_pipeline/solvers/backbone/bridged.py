@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -28,7 +28,7 @@ from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.places import MISTAKEN_PLACES, MOST_STEPS, agreeing_groups
 from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
 from hodge_pipeline.solvers.backbone.step_model import StepModel
-from hodge_pipeline.types import Bools, Ints
+from hodge_pipeline.types import Bools, Floats, Ints
 
 MOST_BREAKS, TRIED_AT_ONCE = 10, 2
 """Breaks that are bridged one after the other, and that are tried each time."""
@@ -72,7 +72,7 @@ def infer_bridged(
         first, as_stated = as_stated, None
     found = first
     for _ in range(most if most and is_sought(first) else 0):
-        better = _better(chain, found, as_stated, judge)
+        better = _better(chain, found, as_stated, judge, outliers)
         if better is None:
             break
         chain, found = better
@@ -126,11 +126,15 @@ def _believed(as_stated: Inferred, found: Inferred) -> bool:
 
 
 def _better(
-    chain: Chain, found: Inferred, as_stated: Inferred | None, judge: Callable[..., Inferred | None]
+    chain: Chain,
+    found: Inferred,
+    as_stated: Inferred | None,
+    judge: Callable[..., Inferred | None],
+    outliers: OutlierModel,
 ) -> tuple[Chain, Inferred] | None:
     """The chain with one more broken step bridged, and its loops judged; None where no step is broken."""
     founds = [found] if as_stated is None else [found, as_stated]
-    for broken, least in [each for one in founds for each in _candidates(chain, one)]:
+    for broken, least in [each for one in founds for each in _candidates(chain, one, outliers)]:
         tried = bridged(chain, broken)
         same = judge(tried, scales=found.scales)  # so that nothing but the step differs
         if same is None or same.log_evidence <= found.log_evidence + least:
@@ -141,7 +145,7 @@ def _better(
     return None
 
 
-def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
+def _candidates(chain: Chain, found: Inferred, outliers: OutlierModel) -> list[tuple[Break, float]]:
     """Breaks to try, each with the log-evidence that the loops must gain by it beside its own."""
     linear, factor = found.start, found.judged.factor
     shares = np.log(mixture(factor)[0])
@@ -150,6 +154,9 @@ def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
     usual, least = StepModel.of(chain), by_chance(len(factor))
     fold = np.log(max((1 / loops_at_place(pairwise.chain.places)).sum(), 1))  # for the best of as many places
     agreed = [each for each in agreed_breaks(pairwise, usual) if each.log_evidence > BY_CHANCE + fold]
+    if any(each.share < CONTRADICTED for each in agreed):
+        nothing = max(_agreed_by_chance(pairwise, usual, shares, outliers)) + BY_CHANCE
+        agreed = [each for each in agreed if each.share >= CONTRADICTED or each.log_evidence > nothing]
     far, agreed = [each for each in agreed if not each.usual], [each for each in agreed if each.usual]
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
     candidates = [(each, least) for each in agreed[:TRIED_AT_ONCE] if each is agreed[0] or each.at != agreed[0].at]
@@ -161,6 +168,27 @@ def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
             candidates.append((of_run, BY_CHANCE - of_run.log_evidence))
     candidates += [(each, max(least - each.log_evidence, BY_CHANCE)) for each in unlike]
     return candidates + [(each, least) for each in far[:1]]
+
+
+def _agreed_by_chance(
+    pairwise: PairwiseConsistency, usual: StepModel, shares: Floats, outliers: OutlierModel
+) -> Iterator[float]:
+    """The log-evidence of the likeliest break where the unused loops end at each other's upper ends, which tells how
+    much wrong ones agree by chance: in streets at right angles, or by motions that all say the same place, often.
+    """
+    rng, chain, rows = np.random.default_rng(5), pairwise.chain, np.flatnonzero(~pairwise.used)
+    for _ in range(DRAWN):
+        ends = chain.ends.copy()
+        ends[rows, 1] = ends[rng.permutation(rows), 1]
+        ends = np.where(np.ptp(ends, axis=1)[:, None] > 0, np.sort(ends, axis=1), chain.ends)
+        linear = linearise(chain.with_loops(np.arange(len(ends)), ends), pairwise.linear.poses)
+        covariance = by_path(linear, rows)
+        log_wrong, by_chain = pairwise.log_wrong.copy(), pairwise.by_chain.copy()
+        log_wrong[rows] = outliers.at(linear.chain, rows, linear.loops[0][rows]).log_density(covariance)
+        factor = student_log_density(linear.loops[0][rows], covariance)[0] - log_wrong[rows]
+        by_chain[rows] = np.logaddexp(shares[0] + factor, shares[1])
+        dealt = replace(pairwise, linear=linear, by_chain=by_chain, log_wrong=log_wrong)
+        yield max((each.log_evidence for each in agreed_breaks(dealt, usual)), default=-np.inf)
 
 
 def bridged(chain: Chain, broken: Break) -> Chain:
