@@ -125,7 +125,7 @@ def _agreeing(chain: Chain, near: Ints) -> tuple[Floats, Floats]:
     closing = closes(chain.motion[near], se3.inverse(low) @ high, gate(chain), np.sqrt(np.diff(ends, axis=1)[:, 0]))
     usual = chi2[closing | (chain.stated & (chi2 < AS_STATED * size))]
     usual_scale = float(np.median(usual)) / MEDIAN_CHI2[size] if len(usual) else 1.0
-    scale = max(usual_scale, 1.0 if chain.stated else _rounding(chain, near))
+    scale = max(usual_scale, _rounding(chain, near))
     fits = chi2 <= STUDENT_99[size] * scale
     doubted = chain.over(ends[fits]) == 0
     over = np.append(0, np.cumsum(doubted & chain.inner))
