@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from scipy.stats import binom
+
 from hodge_pipeline.solvers.backbone.step_tests import StepCounts, is_tested, left_out_steps
 from hodge_pipeline.solvers.backbone.trust import FEW_BREAKS, Backbone, find_backbone
 from hodge_pipeline.types import Bools, Ints, ViewGraph
 
-UNCONTRADICTED = 0.2
-"""Share of the steps left out that no near loop contradicts, from which on groups of wrong loops are suspected: a step
-that was measured wrong is contradicted by loops beside it. In simulated lattices of 200 to 1000 poses, 2 to 20 % of
-whose edges are wrong, with and without triangles, it is up to .13; with groups of wrong loops .33 to 1.
+UNCONTRADICTED, BY_CHANCE = 0.13, 0.05
+"""Share of the steps left out that no near loop contradicts where steps were measured wrong: up to this in simulated
+lattices of 200 to 1000 poses, 2 to 20 % of whose edges are wrong, with and without triangles; with groups of wrong loops
+.33 to 1. And the probability, by that share, of as many or more from which on such groups are not suspected.
 """
 MOST_LEFT_OUT = 0.25
 """Share of all steps left out from which on hundreds of wrong loops are suspected, which join near places and
@@ -34,11 +36,11 @@ def steps_are_wrong(graph: ViewGraph, kept: Bools, loops: Ints) -> bool:
     """
     found = left_out_steps(graph, kept)
     explained = bool(kept[loops].all()) and found.left_out >= FEW_BREAKS
-    return explained and not _is_rival(found) and not _too_many(found)
+    return explained and not _is_rival(found)
 
 
 def _is_rival(found: StepCounts) -> bool:
-    return found.uncontradicted >= max(UNCONTRADICTED * found.left_out, 1)
+    return bool(binom.sf(found.uncontradicted - 1, found.left_out, UNCONTRADICTED) < BY_CHANCE)
 
 
 def _too_many(found: StepCounts) -> bool:
@@ -55,7 +57,9 @@ def lattice_backbone(graph: ViewGraph, kept: Bools, doubted: Backbone | None = N
     if doubted is not None and _explains_enough(doubted, kept):
         return doubted, True
     found = left_out_steps(graph, kept)
-    if not _is_rival(found) and not (doubted is not None and _too_many(found)):
+    if doubted is not None and not doubted.found.confirmed and 0 < found.left_out < FEW_BREAKS:
+        return doubted, True  # breaks that its own search refused
+    if not _is_rival(found):
         return None, False
     backbone = doubted or find_backbone(graph, in_lattice=True)
     if backbone is None:
