@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pycolmap
 import pytest
@@ -17,6 +19,8 @@ from hodge_pipeline.cli.main import app
 from hodge_pipeline.cli.refine_colmap import _lines
 from hodge_pipeline.errors import SourceError, WorkspaceError
 from hodge_pipeline.pairs.edits import listed_edges
+from hodge_pipeline.refine.choice import UNTOLD, Choice
+from hodge_pipeline.refine.model import _decision
 
 
 def test_the_terminal_has_ten_lines_of_80_columns_and_verbose_has_all(
@@ -129,6 +133,10 @@ def test_a_refined_model_and_a_run_never_share_a_folder(tmp_path: Path) -> None:
     kept = replace(result.decision, outcome="optimal", reason="already optimal: noise", doubt="")
     said = _lines(replace(result, decision=kept), alone=True, verbose=False)[0]
     assert said == "verdict  already optimal: noise", "and not twice"
+    found: Any = SimpleNamespace(costs=[result.candidates[0][1]], candidates=[SimpleNamespace(name="as given")])
+    decision = _decision(found, Choice(0, UNTOLD), result.scales, force=False, doubted=False)
+    told = _lines(replace(result, decision=decision), alone=True, verbose=False)[0]
+    assert told.startswith("verdict  kept as given: tracks fix the poses less well"), "which is not optimal"
     with pytest.raises(WorkspaceError, match="holds a refined model: give another --out"):
         hodge_pipeline.run("demo", out, source=tmp_path)
     with pytest.raises(WorkspaceError, match="hodge diagnose .* judges its edges"):

@@ -207,6 +207,26 @@ def test_loops_that_nothing_confirms_are_said_first(tmp_path: Path) -> None:
     assert "verdict Solved by consecutive edges alone, since nothing confirms the 20 others" in said
 
 
+def test_pieces_that_edges_left_out_joined_are_said_first(tmp_path: Path) -> None:
+    told, mute = "1 0 0 1 0 1", "0 0 0 0 0 0"
+    edges = [f"EDGE_SE2 {i} {i + 1} 1 0 0 {mute if i == 2 else told}\n" for i in range(5)]
+    (tmp_path / "in.g2o").write_text("".join(edges))
+    assert solve_file(tmp_path / "in.g2o", SolveOptions()).headline.startswith(
+        "Solved, but in 2 pieces without the edges left out: chi2"
+    )
+    parted = solve_file(tmp_path / "in.g2o", SolveOptions(disable=("2-3",)))
+    assert parted.headline.startswith("Solved: chi2"), "the user parted them"
+
+
+def test_edges_beside_consecutive_ones_are_counted_in_the_first_line(tmp_path: Path) -> None:
+    made = drive(wrong=1.0, loops=20)
+    steps = np.flatnonzero(np.diff(made.graph.edges, axis=1)[:, 0] == 1)
+    twice = made.graph.select(np.concatenate([np.arange(made.graph.edge_count), steps[:30]]))
+    write_g2o(tmp_path / "twice.g2o", twice, made.odometry())
+    headline = solve_file(tmp_path / "twice.g2o", SolveOptions(robust=True)).headline
+    assert headline.startswith("Solved by consecutive edges and 30 that state the same steps again, since nothing ")
+
+
 @pytest.mark.parametrize("ring", ["", "EDGE_SE2 0 1 1 0 0 0 0 0 0 0 0\nEDGE_SE2 2 2 1 0 0 1 0 0 1 0 1\n"])
 @pytest.mark.parametrize("how", [(), ("--robust",)])
 def test_where_no_edge_says_anything_nothing_is_called_solved(tmp_path, ring, how):

@@ -247,6 +247,16 @@ def test_a_tree_is_tested_by_nothing_and_refuted_by_nothing():
     assert solve_robust(wrong, start=truth, diagnosis=DiagnosisOptions(trust="none")).confirmed is False
 
 
+def test_rounding_along_a_path_leaves_no_edge_out():
+    """Unstated information takes its size from what the poses leave over, of a path without loops rounding alone."""
+    steps = se3.exp(0.3 * np.random.default_rng(0).normal(size=(100, 6)))
+    pairs = np.arange(100)[:, None] + [0, 1]
+    graph = ViewGraph.from_edges(np.arange(101), pairs, steps, np.tile(np.eye(6), (100, 1, 1)))
+    solution = solve_robust(graph)
+    assert solution.kept.all() and solution.confirmed is None
+    assert not solution.component.any()
+
+
 def test_an_edge_of_a_vertex_to_itself_is_none_that_was_left_out():
     """A ring and a chord that confirm too little on their own: with nothing left out, nothing is in doubt."""
     graph, truth = band(5, 1, 3)

@@ -76,7 +76,7 @@ def _lines(result: RefinedModel, *, alone: bool, verbose: bool) -> list[str]:
     """
     decision = result.decision
     told = decision.outcome in decision.reason  # "already optimal: …" says it
-    outcome = "" if told else {"worse": "kept as given"}.get(decision.outcome, decision.outcome)
+    outcome = "" if told else "kept as given" if decision.outcome in ("worse", "optimal") else decision.outcome
     named = ", ".join(f"{model.name} ({counted(model.quality.images, 'image')})" for model in result.inputs)
     lines = [] if alone else labelled("of", named)
     lines += labelled("verdict", ": ".join(filter(None, (decision.doubt, outcome, decision.reason))))

@@ -12,7 +12,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.evaluation.difference import alike
 from hodge_pipeline.executors.dask import open_workers
 from hodge_pipeline.refine.candidates import GIVEN, CandidateSet, make_candidates
-from hodge_pipeline.refine.choice import Choice, choose, held_out_score, refused_doubt
+from hodge_pipeline.refine.choice import UNTOLD, Choice, choose, held_out_score, refused_doubt
 from hodge_pipeline.refine.focal import intrinsics_doubt
 from hodge_pipeline.refine.frame import in_frame_of
 from hodge_pipeline.refine.guard import Decision, Measure, PoseChange
@@ -187,9 +187,8 @@ def _decision(found: CandidateSet, choice: Choice, scales: Sequence[Scale], forc
     if scales[0].is_observable and not scales[0].is_one:
         return Decision("refined", f"in metres now; {told}")
     if not choice.row:
-        return Decision(
-            "worse" if before.doubt else "optimal", f"{'' if doubted else 'already optimal: '}{choice.reason}"
-        )
+        lead = "" if doubted or choice.reason == UNTOLD else "already optimal: "
+        return Decision("worse" if before.doubt else "optimal", f"{lead}{choice.reason}")
     return Decision("forced", f"{choice.reason}; {told}") if choice.reason else Decision("refined", told)
 
 

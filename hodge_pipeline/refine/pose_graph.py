@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from hodge_pipeline import registry
+from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.conventions import inverted_notes
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import solve_robust
@@ -92,10 +93,22 @@ class SolvedFile:
         if not self.doubt and summary["edges_ignored"] == summary["edges"]:
             return "Nothing to solve: no edge joins two vertices with information, so every pose is as it was"
         if self.choices.robust and self.solution.confirmed is None and "tested_edges" in self.solution.metrics:
+            again = summary["edges"] - summary["edges_ignored"] - summary["poses"] + summary["pieces"]
+            alone = f"and {again} that state the same steps again" if again > 0 else "alone"
             others = f"nothing confirms the {summary['edges_ignored']} others (without --robust all count)"
-            return f"Solved by consecutive edges alone, since {others}: {fell}"
-        proven = ", globally optimal" if summary["certified"] else ""
-        return f"Solved, but {self.doubt}: {fell}" if self.doubt else f"Solved{proven}: {fell}"
+            where = f", {self.torn}" if self.torn else ""
+            return f"Solved by consecutive edges {alone}{where}, since {others}: {fell}"
+        proven = ", globally optimal" if summary["certified"] and not self.doubt else ""
+        doubts = " and ".join(filter(None, (self.doubt, self.torn)))
+        return f"Solved{proven}, but {doubts}: {fell}" if doubts else f"Solved{proven}: {fell}"
+
+    @property
+    def torn(self) -> str:
+        """In how many pieces the poses are, where edges that the solve left out join these; "" elsewhere."""
+        given = self.graph.edges[~disabled_edges(self.graph, self.choices.disable)]
+        pieces = int(self.solution.component.max(initial=-1)) + 1
+        joined = int(connected_components(given, self.graph.vertex_count).max(initial=-1)) + 1
+        return f"in {pieces} pieces without the edges left out" if pieces > joined else ""
 
     def summary(self) -> dict[str, Any]:
         """The numbers of the solve under keys that stay, for `--json` and the report."""

@@ -12,6 +12,8 @@ from hodge_pipeline.types import Floats, Solution, ViewGraph
 
 ROUNDS, SETTLED = 4, 1e-2
 """Most rounds, and the largest change of a weight that ends them: less moves no edge in or out."""
+ROUNDING = 1e-9
+"""Radians, and share of the poses' distance from the origin: more than rounding adds up to in thousands of products."""
 
 
 def reweighted(
@@ -28,8 +30,16 @@ def reweighted(
     used, axes = weights > 0, 3 if dimension_of(graph) == 2 else 6
     for _ in range(ROUNDS):
         chi2 = np.maximum(chi2_by_information(graph, solution.world_from_cam), 0.0)
-        new = np.where(used, student_weight(chi2, axes, usual=chi2[used], registered=registered), 0.0)
+        usual = chi2[used & (chi2 > _chi2_of_rounding(graph, solution.world_from_cam))]
+        new = np.where(used, student_weight(chi2, axes, usual=usual, registered=registered), 0.0)
         if np.abs(new - weights).max(initial=0.0) < SETTLED:
             break
         weights, solution = new, solved(new, solution.world_from_cam)
     return weights, solution
+
+
+def _chi2_of_rounding(graph: ViewGraph, world_from_cam: Floats) -> Floats:
+    """The χ² (E,) of what rounding leaves over at poses (V, 4, 4), as of edges of a path, which no cycle tests."""
+    far = float(np.abs(world_from_cam[:, :3, 3]).max(initial=0.0))
+    squares = (ROUNDING * np.repeat([1.0, far], 3)) ** 2
+    return np.asarray(np.einsum("eii,i->e", graph.information, squares))
