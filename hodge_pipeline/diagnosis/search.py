@@ -16,6 +16,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from hodge_pipeline import se3
+from hodge_pipeline.diagnosis.cycles import CLOSES_BELOW
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import PER_FOLD, Alignment, agreement_of, mean_motions
 from hodge_pipeline.diagnosis.placement import Placements, consecutive_log_evidence, log_evidence
@@ -194,10 +195,6 @@ def _cuts(here: Placements, trials: list[Trial]) -> Bools:
     return np.asarray(inside[:source].reshape(shape) & np.stack([trial.movable for trial in trials])[:, None])
 
 
-SIGMAS_APART = 12.0
-"""Standard deviations by which the rotations of two motions may differ to be compared."""
-
-
 @dataclass(frozen=True)
 class Proposals:
     """Edges left out, each in both directions: view `mover (P,)` should move by `motion (P, 4, 4)` of the world, view
@@ -250,6 +247,6 @@ def _near_in_angle(evidence: Evidence, edge: Ints, motion: Floats) -> tuple[Ints
     """Pairs of proposals (rows) whose rotations are within the largest gate of any edge."""
     quat = se3.to_quat_xyzw(motion).astype(np.float32)
     likeness = np.abs(quat @ quat.T)
-    widest = min(SIGMAS_APART * float(evidence.noise.rotation_rad[edge].max(initial=0.0)), np.pi)
+    widest = min(np.sqrt(2 * CLOSES_BELOW) * float(evidence.noise.rotation_rad[edge].max(initial=0.0)), np.pi)
     first, second = np.nonzero(likeness >= np.cos(widest / 2))
     return first, second
