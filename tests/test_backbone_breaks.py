@@ -11,7 +11,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.solvers.backbone.chain import make_chain
-from hodge_pipeline.solvers.backbone.inference import BY_CHANCE
+from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE
 from hodge_pipeline.solvers.backbone.step_model import StepModel
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.types import ViewGraph

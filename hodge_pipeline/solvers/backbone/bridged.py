@@ -11,11 +11,9 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.breaks import LOOSE, Break, Runs, agreed_breaks, unusual_breaks
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
-from hodge_pipeline.solvers.backbone.evidence import OutlierModel, mixture, student_log_density
+from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mixture, student_log_density
 from hodge_pipeline.solvers.backbone.fit import Fit, optimised
 from hodge_pipeline.solvers.backbone.inference import (
-    BY_CHANCE,
-    MISTAKEN,
     Inferred,
     by_chance,
     infer,
@@ -25,7 +23,7 @@ from hodge_pipeline.solvers.backbone.judge import by_path
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
-from hodge_pipeline.solvers.backbone.places import MISTAKEN_PLACES, MOST_STEPS, agreeing_groups
+from hodge_pipeline.solvers.backbone.places import MISTAKEN, MISTAKEN_PLACES, MOST_STEPS, agreeing_groups
 from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
 from hodge_pipeline.solvers.backbone.step_model import StepModel
 from hodge_pipeline.types import Bools, Ints

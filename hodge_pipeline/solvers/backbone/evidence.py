@@ -12,6 +12,8 @@ from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.linear import cholesky, motion_residuals
 from hodge_pipeline.types import Bools, Floats, Ints
 
+BY_CHANCE = float(np.log(100.0))
+"""Log-evidence, in nats, that chance reaches in one graph of a hundred."""
 PAIRS, FEWEST_PAIRS = 4000, 200
 """Random pairs of positions that an outlier shape is estimated from; an octave with fewer gets that of any two."""
 

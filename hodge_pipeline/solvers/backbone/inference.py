@@ -10,12 +10,12 @@ from scipy.special import expit
 
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.solvers.backbone.chain import Chain
-from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel, mixture
+from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, EVEN, OutlierModel, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, from_rotations, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, judge
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
-from hodge_pipeline.solvers.backbone.places import MOST_STEPS, Places
+from hodge_pipeline.solvers.backbone.places import MISTAKEN, MOST_STEPS, Places
 from hodge_pipeline.solvers.backbone.polish import polished
 from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
 from hodge_pipeline.types import Bools, Floats
@@ -260,9 +260,9 @@ def refused(found: Inferred, trusted: Bools) -> Inferred:
     return replace(found, used=trusted.copy(), linear=found.start, reduced=reduced)
 
 
-BY_CHANCE, BY_CHANCE_EACH_FOLD = float(np.log(100.0)), 3.0
-"""Log-evidence that chance reaches in one graph of a hundred, and its increase with each e-fold of loops, measured with
-random loops in simulated graphs and in those of Bicocca and RobotCar, whose best reach half of it.
+BY_CHANCE_EACH_FOLD = 3.0
+"""Increase of the log-evidence that chance reaches with each e-fold of loops, measured with random loops in simulated
+graphs and in those of Bicocca and RobotCar, whose best reach half of it.
 """
 
 
@@ -274,10 +274,6 @@ def _agreeing(judged: Judged) -> Bools:
 def _limit(judged: Judged) -> float:
     """The log Bayes factor that one of the wrong loops is expected to reach by chance: log of their expected number."""
     return float(np.log(max(expit(-judged.log_odds).sum(), 1)))
-
-
-MISTAKEN = float(np.log(20.0))
-"""Log-odds of right places against mistaken ones that are enough."""
 
 
 def by_chance(count: int) -> float:
