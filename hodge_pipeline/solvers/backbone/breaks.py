@@ -19,8 +19,6 @@ PLATEAU = 12.0
 """Nats below the best step at which a step is no candidate for the break."""
 MOST_UNUSUAL = 3
 """Steps that are tried by their own size alone: a limit on cost."""
-LOOSE = 2.0
-"""Factor from the standard deviations of the one loop that a bridge follows from to those of the bridge."""
 LEAST_COST = 4.0
 """Nats that the residual of a run must cost before its steps are tested: a limit on time."""
 
@@ -89,11 +87,8 @@ def _far_break(pairwise: PairwiseConsistency, loop: int, at: Ints, score: Floats
     carried on, or its odometry stood still.
     """
     row = int(np.argmax(score))
-    one = at[row : row + 1]
-    end, covariance = pairwise.predicted(np.array([loop]), one - 1, one)
-    motion = se3.inverse(pairwise.linear.poses[one[0] - 1]) @ end[0]
-    motion[:3, :3] = se3.project_to_so3(motion[:3, :3])
-    return Break(int(one[0]), motion, LOOSE**2 * covariance[0], float(score[row]), usual=False)
+    one = int(at[row])
+    return Break(one, *pairwise.bridge(loop, one - 1, one), float(score[row]), usual=False)
 
 
 def unusual_breaks(usual: StepModel) -> list[Break]:

@@ -8,8 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from hodge_pipeline import se3
-from hodge_pipeline.solvers.backbone.breaks import LOOSE, Break, Runs, agreed_breaks, unusual_breaks
+from hodge_pipeline.solvers.backbone.breaks import Break, Runs, agreed_breaks, unusual_breaks
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mixture, student_log_density
 from hodge_pipeline.solvers.backbone.fit import Fit, optimised
@@ -60,7 +59,7 @@ def infer_bridged(
     whether breaks should be sought, by the loops judged without any.
     """
     chain = unbroken = joined(chain)
-    outliers = OutlierModel.of(chain, chain.poses)  # one for all trials, which makes their evidence comparable
+    outliers = OutlierModel.of(chain)  # one for all trials, which makes their evidence comparable
     judge = partial(infer, outliers=outliers, trusted=trusted, may_thin=may_thin)
     first = judge(chain)
     if first is None:
@@ -178,7 +177,7 @@ def joined(chain: Chain) -> Chain:
     learned, evidence = None, dict[tuple[int, int], JoinEvidence]()
     while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
         poses = chain.poses
-        outliers = OutlierModel.of(chain, poses)
+        outliers = OutlierModel.of(chain)
         scales, shares = learned = learned or next(learned_scales(chain, outliers))
         linear, rows = linearise(scales.applied(chain), poses), np.arange(len(chain.ends))
         covariance = by_path(linear, rows)
@@ -208,14 +207,11 @@ def joined(chain: Chain) -> Chain:
 def _joined_by(chain: Chain, pairwise: PairwiseConsistency, loop: int, low: int, high: int) -> Chain:
     """The chain with a bridge between two paths that leads as one loop between them does."""
     linear = pairwise.linear
-    last, first = np.flatnonzero(chain.path == low)[-1:], np.flatnonzero(chain.path == high)[:1]
+    last, first = np.flatnonzero(chain.path == low)[-1], np.flatnonzero(chain.path == high)[0]
     # bridges on the way count as exact: with its covariance each would allow for as much as all before it together
     steps = np.where(chain.joins[:, None, None], 0.0, linear.chain.step_covariance)
     exact = replace(pairwise, linear=replace(linear, chain=replace(linear.chain, step_covariance=steps)))
-    end, covariance = exact.predicted(np.array([loop]), last, first)
-    motion = se3.inverse(linear.poses[last[0]]) @ end[0]
-    motion[:3, :3] = se3.project_to_so3(motion[:3, :3])  # else rounding doubles with each path
-    return linked(chain, low, high, motion, LOOSE**2 * covariance[0])
+    return linked(chain, low, high, *exact.bridge(loop, int(last), int(first)))
 
 
 @dataclass(frozen=True)

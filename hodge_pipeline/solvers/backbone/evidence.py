@@ -31,9 +31,9 @@ class OutlierModel:
     axes: Floats
 
     @classmethod
-    def of(cls, chain: Chain, poses: Floats) -> OutlierModel:
+    def of(cls, chain: Chain) -> OutlierModel:
         """Estimated from the loops' motions put between random positions of one path."""
-        rng = np.random.default_rng(0)
+        rng, poses = np.random.default_rng(0), chain.poses
         pairs = rng.integers(0, chain.size, (PAIRS, 2))
         shapes = [_shape(chain, poses, pairs[_on_one_path(chain, pairs)], rng)]
         for octave in reversed(range(int(np.log2(max(chain.size, 2))))):
