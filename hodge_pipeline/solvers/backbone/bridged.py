@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from hodge_pipeline.complex.chi2 import MEDIAN_CHI2
 from hodge_pipeline.solvers.backbone.breaks import Break, Runs, agreed_breaks, unusual_breaks
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mixture, student_log_density
@@ -39,10 +40,6 @@ RobotCar's .39, .48.
 """
 DRAWN = 3
 """Times that the motions of all loops are drawn at random."""
-QUANTILE, NORMAL_QUANTILE = 0.75, 1.1503
-"""Quantile of the distance from the median by which the spread of motions is estimated, robust to a few outliers; and
-that of a normal distribution.
-"""
 
 
 def infer_bridged(
@@ -93,7 +90,7 @@ def _found_by_chance(chain: Chain, found: Inferred, trusted: Bools, judge: Calla
     """
     rng, twists = np.random.default_rng(4), chain.log(chain.motion)
     middle = np.median(twists, axis=0)
-    spread = np.quantile(np.abs(twists - middle), QUANTILE, axis=0) / NORMAL_QUANTILE
+    spread = np.median(np.abs(twists - middle), axis=0) / np.sqrt(MEDIAN_CHI2[1])
     for _ in range(DRAWN):
         drawn = chain.exp(middle + spread * rng.standard_normal(twists.shape))
         motion = np.where(trusted[:, None, None], chain.motion, drawn)
