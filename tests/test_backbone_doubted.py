@@ -13,6 +13,7 @@ from benchmarks.spoilt_graphs import lattice_cases
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.solvers.backbone import bridged, inference
+from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.types import Floats, ViewGraph
 from tests.backbone_graphs import Drive, at_one_place, broken, drive, round_trip
@@ -146,7 +147,7 @@ def test_poses_are_not_followed_to_where_loops_are_less_likely(monkeypatch: pyte
 
     monkeypatch.setattr(inference._Trial, "agreed", followed)
     diagnose(drive(seed=0, world="corridor", count=150, loops=100, wrong=0.8, in_groups=True).graph)
-    falls = [[each < max(row) - inference.BY_CHANCE for each in row] for row in rounds]
+    falls = [[each < max(row) - BY_CHANCE for each in row] for row in rounds]
     assert any(row[-1] for row in falls) and not any(fell for row in falls for fell in row[:-1])
 
 

@@ -16,6 +16,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from hodge_pipeline import se3
+from hodge_pipeline.diagnosis.cycles import CLOSES_BELOW
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import PER_FOLD, Alignment, agreement_of, mean_motions
 from hodge_pipeline.diagnosis.placement import Placements, consecutive_log_evidence, log_evidence
@@ -33,9 +34,8 @@ dominates.
 """
 MOST_PROPOSALS = 1000
 """Edges that propose a motion, the likeliest by the order of the views: a limit on cost."""
-LEAST_GAIN, LEAST_OF_FEW = 2.0, 0.7
-"""Least gain of a move, nats; and where not every pair was tried, so that few edges agree by chance: 2 edges against 1,
-4 against 2."""
+LEAST_GAIN = 2.0
+"""Least gain of a move, nats."""
 CUT_THROUGH = (3.0, 20.0)
 """Expected numbers of edges in a cut: linearised there, each edge costs PER_FOLD / (1 + number)."""
 PULL = 2.0
@@ -99,8 +99,7 @@ def _moves(here: Placements) -> list[Move]:
     together = max(TOGETHER // max(len(here.pairs), 1), 1)
     for first in range(0, len(tried), together):
         moves += _best_moves(here, Trial.of(here, proposals, tried[first : first + together]))
-    least = LEAST_GAIN if evidence.exhaustive else LEAST_OF_FEW
-    better = sorted((move for move in moves if move.gain > least), key=lambda move: -move.gain)
+    better = sorted((move for move in moves if move.gain > LEAST_GAIN), key=lambda move: -move.gain)
     return _independent(better, len(here.found.piece))
 
 
@@ -194,10 +193,6 @@ def _cuts(here: Placements, trials: list[Trial]) -> Bools:
     return np.asarray(inside[:source].reshape(shape) & np.stack([trial.movable for trial in trials])[:, None])
 
 
-SIGMAS_APART = 12.0
-"""Standard deviations by which the rotations of two motions may differ to be compared."""
-
-
 @dataclass(frozen=True)
 class Proposals:
     """Edges left out, each in both directions: view `mover (P,)` should move by `motion (P, 4, 4)` of the world, view
@@ -250,6 +245,6 @@ def _near_in_angle(evidence: Evidence, edge: Ints, motion: Floats) -> tuple[Ints
     """Pairs of proposals (rows) whose rotations are within the largest gate of any edge."""
     quat = se3.to_quat_xyzw(motion).astype(np.float32)
     likeness = np.abs(quat @ quat.T)
-    widest = min(SIGMAS_APART * float(evidence.noise.rotation_rad[edge].max(initial=0.0)), np.pi)
+    widest = min(np.sqrt(2 * CLOSES_BELOW) * float(evidence.noise.rotation_rad[edge].max(initial=0.0)), np.pi)
     first, second = np.nonzero(likeness >= np.cos(widest / 2))
     return first, second

@@ -12,8 +12,6 @@ from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 LONGEST_NAMED = 12
 """Most vertices of a cycle that are all named."""
-ROUNDING = 1e-9
-"""Metres and degrees that are printed as 0."""
 MOST_NAMED = 4
 """Most edges sharing the blame that are all named; else their number is."""
 TOO_LONG = "every loop through it is too long to be listed: nothing tests it"
@@ -124,5 +122,4 @@ def distance(metres: float, degrees: float) -> str:
 
 
 def _amount(metres: float, degrees: float) -> str:
-    metres, degrees = (value if value >= ROUNDING else 0.0 for value in (metres, degrees))
-    return f"{metres:.3g} m, {degrees:.3g}°"
+    return f"{round(metres, 9):.3g} m, {round(degrees, 9):.3g}°"  # rounding errors are 0

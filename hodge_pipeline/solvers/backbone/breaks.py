@@ -20,8 +20,6 @@ PLATEAU = 12.0
 """Nats below the best step at which a step is no candidate for the break."""
 MOST_UNUSUAL = 3
 """Steps that are tried by their own size alone: a limit on cost."""
-LOOSE = 2.0
-"""Factor from the standard deviations of the one loop that a bridge follows from to those of the bridge."""
 LEAST_COST = 4.0
 """Nats that the residual of a run must cost before its steps are tested: a limit on time."""
 
@@ -77,16 +75,10 @@ def _share(pairwise: PairwiseConsistency, rows: Ints, agree: Bools, at: int) -> 
 
 
 def _log_with_usual_step(pairwise: PairwiseConsistency, usual: StepModel, loop: Ints, at: Ints) -> Floats:
-    """Log-density (K,) of `loop (K,)` if it is right and the step to position `at (K,)` is a usual one.
-
-    Where the measured step is of some kind, only the most frequent kind may replace it: nothing says that the robot
-    turned a corner there.
-    """
+    """Log-density (K,) of `loop (K,)` if it is right and the step to position `at (K,)` is a usual one."""
     end, covariance = pairwise.predicted(loop, at - 1, at)
     off = usual.off(pairwise.chain, pairwise.chain.between(pairwise.linear.poses[at - 1], end))
-    each = np.stack([student_log_density(one, covariance + usual.covariance)[0] for one in off])
-    each[1:, usual.kind[at]] = -np.inf
-    return np.asarray(np.logaddexp.reduce(np.log(usual.shares)[:, None] + each, axis=0))
+    return student_log_density(off, covariance + usual.covariance)[0]
 
 
 def _break(pairwise: PairwiseConsistency, usual: StepModel, loop: int, at: Ints, score: Floats) -> Break:
@@ -96,13 +88,11 @@ def _break(pairwise: PairwiseConsistency, usual: StepModel, loop: int, at: Ints,
     row = int(np.argmax(score))
     one = at[row : row + 1]
     end, covariance = pairwise.predicted(np.array([loop]), one - 1, one)
-    off = usual.off(pairwise.chain, pairwise.chain.between(pairwise.linear.poses[one - 1], end))[:, 0]
-    whole = np.broadcast_to(covariance[0] + usual.covariance, (len(off), *covariance.shape[1:]))
-    kind = int(np.argmax(np.log(usual.shares) + student_log_density(off, whole)[0]))
-    chi2 = mahalanobis(off, whole)[0][kind]
+    off = usual.off(pairwise.chain, pairwise.chain.between(pairwise.linear.poses[one - 1], end))
+    chi2 = mahalanobis(off, covariance + usual.covariance)[0][0]
     wide = usual.covariance * max(1.0, 1 / float(tail_weight(chi2, off.shape[1])))
-    towards = wide @ np.linalg.solve(wide + covariance[0], off[kind])
-    return Break(int(one[0]), usual.centres[kind] @ pairwise.chain.exp(towards), wide, float(score[row]))
+    towards = wide @ np.linalg.solve(wide + covariance[0], off[0])
+    return Break(int(one[0]), usual.centre @ pairwise.chain.exp(towards), wide, float(score[row]))
 
 
 def _far_break(pairwise: PairwiseConsistency, loop: int, at: Ints, score: Floats) -> Break:
@@ -110,17 +100,14 @@ def _far_break(pairwise: PairwiseConsistency, loop: int, at: Ints, score: Floats
     carried on, or its odometry stood still.
     """
     row = int(np.argmax(score))
-    one = at[row : row + 1]
-    end, covariance = pairwise.predicted(np.array([loop]), one - 1, one)
-    motion = se3.inverse(pairwise.linear.poses[one[0] - 1]) @ end[0]
-    motion[:3, :3] = se3.project_to_so3(motion[:3, :3])
-    return Break(int(one[0]), motion, LOOSE**2 * covariance[0], float(score[row]), usual=False)
+    one = int(at[row])
+    return Break(one, *pairwise.bridge(loop, one - 1, one), float(score[row]), usual=False)
 
 
 def unusual_breaks(usual: StepModel) -> list[Break]:
     """Breaks at the most unusual steps, the most unusual first, whatever the loops say; `log_evidence` is `unusual`."""
     rows = np.argsort(-usual.unusual)
-    return [Break(int(at), usual.centres[0], usual.covariance, float(usual.unusual[at])) for at in rows[:MOST_UNUSUAL]]
+    return [Break(int(at), usual.centre, usual.covariance, float(usual.unusual[at])) for at in rows[:MOST_UNUSUAL]]
 
 
 @dataclass(frozen=True)

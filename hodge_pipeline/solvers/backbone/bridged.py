@@ -8,14 +8,12 @@ from functools import partial
 
 import numpy as np
 
-from hodge_pipeline import se3
-from hodge_pipeline.solvers.backbone.breaks import LOOSE, Break, Runs, agreed_breaks, unusual_breaks
+from hodge_pipeline.complex.chi2 import MEDIAN_CHI2
+from hodge_pipeline.solvers.backbone.breaks import Break, Runs, agreed_breaks, unusual_breaks
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
-from hodge_pipeline.solvers.backbone.evidence import OutlierModel, mixture, student_log_density
+from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mixture, student_log_density
 from hodge_pipeline.solvers.backbone.fit import Fit, optimised
 from hodge_pipeline.solvers.backbone.inference import (
-    BY_CHANCE,
-    MISTAKEN,
     Inferred,
     by_chance,
     infer,
@@ -25,7 +23,7 @@ from hodge_pipeline.solvers.backbone.judge import by_path
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
-from hodge_pipeline.solvers.backbone.places import MISTAKEN_PLACES, MOST_STEPS, agreeing_groups
+from hodge_pipeline.solvers.backbone.places import MISTAKEN, MISTAKEN_PLACES, MOST_STEPS, agreeing_groups
 from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
 from hodge_pipeline.solvers.backbone.step_model import StepModel
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -42,10 +40,6 @@ RobotCar's .39, .48.
 """
 DRAWN = 3
 """Times that the motions of all loops are drawn at random."""
-QUANTILE, NORMAL_QUANTILE = 0.75, 1.1503
-"""Quantile of the distance from the median by which the spread of motions is estimated, robust to a few outliers; and
-that of a normal distribution.
-"""
 
 
 def infer_bridged(
@@ -62,7 +56,7 @@ def infer_bridged(
     whether breaks should be sought, by the loops judged without any.
     """
     chain = unbroken = joined(chain)
-    outliers = OutlierModel.of(chain, chain.poses)  # one for all trials, which makes their evidence comparable
+    outliers = OutlierModel.of(chain)  # one for all trials, which makes their evidence comparable
     judge = partial(infer, outliers=outliers, trusted=trusted, may_thin=may_thin)
     first = judge(chain)
     if first is None:
@@ -96,7 +90,7 @@ def _found_by_chance(chain: Chain, found: Inferred, trusted: Bools, judge: Calla
     """
     rng, twists = np.random.default_rng(4), chain.log(chain.motion)
     middle = np.median(twists, axis=0)
-    spread = np.quantile(np.abs(twists - middle), QUANTILE, axis=0) / NORMAL_QUANTILE
+    spread = np.median(np.abs(twists - middle), axis=0) / np.sqrt(MEDIAN_CHI2[1])
     for _ in range(DRAWN):
         drawn = chain.exp(middle + spread * rng.standard_normal(twists.shape))
         motion = np.where(trusted[:, None, None], chain.motion, drawn)
@@ -208,7 +202,7 @@ def joined(chain: Chain) -> Chain:
     learned, evidence = None, dict[tuple[int, int], JoinEvidence]()
     while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
         poses = chain.poses
-        outliers = OutlierModel.of(chain, poses)
+        outliers = OutlierModel.of(chain)
         scales, shares = learned = learned or next(learned_scales(chain, outliers))
         linear, rows = linearise(scales.applied(chain), poses), np.arange(len(chain.ends))
         covariance = by_path(linear, rows)
@@ -238,14 +232,11 @@ def joined(chain: Chain) -> Chain:
 def _joined_by(chain: Chain, pairwise: PairwiseConsistency, loop: int, low: int, high: int) -> Chain:
     """The chain with a bridge between two paths that leads as one loop between them does."""
     linear = pairwise.linear
-    last, first = np.flatnonzero(chain.path == low)[-1:], np.flatnonzero(chain.path == high)[:1]
+    last, first = np.flatnonzero(chain.path == low)[-1], np.flatnonzero(chain.path == high)[0]
     # bridges on the way count as exact: with its covariance each would allow for as much as all before it together
     steps = np.where(chain.joins[:, None, None], 0.0, linear.chain.step_covariance)
     exact = replace(pairwise, linear=replace(linear, chain=replace(linear.chain, step_covariance=steps)))
-    end, covariance = exact.predicted(np.array([loop]), last, first)
-    motion = se3.inverse(linear.poses[last[0]]) @ end[0]
-    motion[:3, :3] = se3.project_to_so3(motion[:3, :3])  # else rounding doubles with each path
-    return linked(chain, low, high, motion, LOOSE**2 * covariance[0])
+    return linked(chain, low, high, *exact.bridge(loop, int(last), int(first)))
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,8 @@ from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.linear import cholesky, motion_residuals
 from hodge_pipeline.types import Bools, Floats, Ints
 
+BY_CHANCE = float(np.log(100.0))
+"""Log-evidence, in nats, that chance reaches in one graph of a hundred."""
 PAIRS, FEWEST_PAIRS = 4000, 200
 """Random pairs of positions that an outlier shape is estimated from; an octave with fewer gets that of any two."""
 
@@ -29,9 +31,9 @@ class OutlierModel:
     axes: Floats
 
     @classmethod
-    def of(cls, chain: Chain, poses: Floats) -> OutlierModel:
+    def of(cls, chain: Chain) -> OutlierModel:
         """Estimated from the loops' motions put between random positions of one path."""
-        rng = np.random.default_rng(0)
+        rng, poses = np.random.default_rng(0), chain.poses
         pairs = rng.integers(0, chain.size, (PAIRS, 2))
         shapes = [_shape(chain, poses, pairs[_on_one_path(chain, pairs)], rng)]
         for octave in reversed(range(int(np.log2(max(chain.size, 2))))):

@@ -190,19 +190,12 @@ class Fit:
         lever = self.linear.chain.lever(self.linear.poses[self.reduced.ends, :3, 3])
         return _to_origin(lever, at_ends[..., 0]), float((at_ends * force).sum())
 
-    def moved(self, moves: Floats) -> Floats:
-        """The poses (n, 4, 4) after a step (R, p) of the ends: the gap of a run is spread over its steps by their
-        covariance, positions beyond the outermost ends follow them rigidly.
+    def moved(self, move: Floats) -> Floats:
+        """The poses (n, 4, 4) after motions `move (R, 4, 4)` of the ends, however large, from the left: the gap of a
+        run is spread over its steps by their covariance, positions beyond the outermost ends follow them rigidly.
         """
-        chain, (first, second) = self.linear.chain, self.reduced.runs.T
-        out = self._bent(moves[second] - moves[first]) + moves[self.reduced.anchor]
-        out[~self.reduced.touched] = 0.0
-        return chain.compose(chain.exp(out), self.linear.poses)
-
-    def with_ends(self, ends: Floats) -> Floats:
-        """The poses (n, 4, 4) where the ends have poses (R, 4, 4), however far from the present ones."""
         linear, (first, second), touched = self.linear, self.reduced.runs.T, self.reduced.touched
-        chain, move = linear.chain, ends @ se3.inverse(linear.poses[self.reduced.ends])
+        chain = linear.chain
         out = self._bent(chain.log(chain.between(move[first], move[second])))
         out[~touched] = 0.0
         moved = chain.compose(chain.exp(out), linear.poses)
@@ -253,7 +246,7 @@ def optimised(fit: Fit, steps: int) -> Fit:
             break
         for _ in range(HALVINGS):
             with np.errstate(over="ignore", invalid="ignore"):  # far too long a step ends in no number, and is halved
-                tried = replace(fit, linear=linearise(fit.linear.chain, fit.moved(moves)))
+                tried = replace(fit, linear=linearise(fit.linear.chain, fit.moved(fit.linear.chain.exp(moves))))
                 is_better = tried.cost < before
             if is_better:
                 fit = tried
@@ -280,7 +273,7 @@ def from_rotations(bare: Fit, steps: int) -> Linear:
     information[:, chain.axes[:, None], chain.axes] = of_axes
     graph = ViewGraph.from_edges(np.arange(len(poses)), reduced.network.edges, motion, information)
     found = solve(graph, start=poses, dimension=3 if chain.is_spatial else 2, max_iterations=steps)
-    return linearise(chain, bare.with_ends(found.world_from_cam))
+    return linearise(chain, bare.moved(found.world_from_cam @ se3.inverse(poses)))
 
 
 LEAST_LEFT = 1e-6

@@ -10,15 +10,15 @@ from scipy.special import expit
 
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.solvers.backbone.chain import Chain
-from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel, mixture
+from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, EVEN, OutlierModel, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, from_rotations, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, judge
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
-from hodge_pipeline.solvers.backbone.places import MOST_STEPS, Places
+from hodge_pipeline.solvers.backbone.places import MISTAKEN, MOST_STEPS, Places
 from hodge_pipeline.solvers.backbone.polish import polished
 from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
-from hodge_pipeline.types import Bools, Floats
+from hodge_pipeline.types import Bools, Floats, Ints
 
 ROUNDS = 6
 """Rounds of `_Trial.agreed`: a limit on cost."""
@@ -43,11 +43,6 @@ class Inferred:
     log_evidence: float
     confirmed: bool
 
-    @property
-    def scales_here(self) -> Scales:
-        """The scales of errors by what the final poses leave."""
-        return self.scales.at_solution(Fit(self.reduced, self.linear))
-
     @cached_property
     def polished(self) -> tuple[Linear, Floats]:
         """The chain at the final poses, and factors (M,) on the loops' standard deviations: see `polished`."""
@@ -71,10 +66,10 @@ def infer(
         if other is None:
             return None
         found = other if found is None or other.log_evidence > found.log_evidence else found
-    for _ in range(MOST_LEARNED if scales is None else 0):
+    for _ in range(MOST_ANEW if scales is None else 0):
         if found is None or not found.confirmed:
             break
-        here = found.scales_here
+        here = found.scales.at_solution(Fit(found.reduced, found.linear))
         if not found.scales.differ_much(here) or not _others_agree(found, here.applied(chain), outliers, trusted):
             break
         other = _Trial.of(chain, outliers, trusted, may_thin, here, EVEN).found()
@@ -93,8 +88,12 @@ def _others_agree(found: Inferred, chain: Chain, outliers: OutlierModel, trusted
     return bool(((_agreeing(judged) | trusted) != found.used).any())
 
 
-MOST_LEARNED = 3
-"""Times that scales are learned anew: a limit on cost."""
+MOST_ANEW = 3
+"""Times that scales are learned anew, and that loops are judged as places are left out: limits on cost."""
+
+
+class _TooManyLoops(Exception):
+    """The right loops leave more than `MOST_UNKNOWNS`."""
 
 
 @dataclass(frozen=True)
@@ -130,29 +129,25 @@ class _Trial:
         return cls(start, judge(start, None, shares, outliers), shares, outliers, trusted, may_thin, scales)
 
     def found(self) -> Inferred | None:
-        """What is `inferred`, or that nothing is used where nothing can be computed."""
+        """What is `inferred`, or that nothing is used where nothing can be computed; None as in `infer`."""
         try:
             return self.inferred()
+        except _TooManyLoops:
+            return None
         except np.linalg.LinAlgError:  # loops tear paths so far apart that covariances are lost in rounding
             reduced = thinned(self.start.chain, np.flatnonzero(self.trusted))
             return Inferred(
                 self.trusted, self.alone, self.scales, self.start, self.start, reduced, 0.0, confirmed=False
             )
 
-    def inferred(self) -> Inferred | None:
-        """The loops judged at the poses of the right ones; None where these are too many: see `infer`."""
-        grown = self.grown()
-        if grown is None:
-            return None
-        used, rated = grown
+    def inferred(self) -> Inferred:
+        """The loops judged at the poses of the right ones."""
+        used, rated = self.grown()
         shares, linear = rated.shares, rated.linear
         start, chain, trusted = self.start, self.start.chain, self.trusted
         fold = int(chain.broken.sum()) * float(np.log(chain.size))  # for the choice of the broken steps among all
-        for _ in range(REARRANGED):
-            found = self.agreed(used | trusted, shares, linear)
-            if found is None:
-                return None
-            agreed, judged, linear = found
+        for _ in range(MOST_ANEW):
+            agreed, judged, linear = self.agreed(used | trusted, shares, linear)
             before, used, confirmed = used, agreed, False
             if not agreed.any() or (judged.factor[agreed] - np.log(agreed.sum())).sum() <= by_chance(int(agreed.sum())):
                 break
@@ -178,7 +173,7 @@ class _Trial:
         linear, reduced = fit.linear if used.any() else start, thinned(chain, np.flatnonzero(used))
         return Inferred(used, judged, self.scales, start, linear, reduced, top, confirmed)
 
-    def grown(self) -> tuple[Bools, _Rated] | None:
+    def grown(self) -> tuple[Bools, _Rated]:
         """Loops (M,) to begin with, and all loops at their poses: the strongest alone, then in rounds those that stand
         out at the new poses.
 
@@ -189,37 +184,36 @@ class _Trial:
         used = (self.alone.factor > 2 * limit) | trusted
         rated = self.rated(used, self.start, self.shares)
         for number in range(MOST_GROWN):
-            if rated is None:
-                return None
             before, used = used, (rated.score > limit) | (used & (rated.score > 0)) | trusted
             if number and used.sum() <= before.sum():
                 break
             rated = self.rated(used, rated.linear, rated.shares)
-        return None if rated is None else (used, rated)
+        return used, rated
 
-    def rated(self, used: Bools, linear: Linear, shares: Floats) -> _Rated | None:
-        """All loops at the poses of one used loop (M,) of each place, optimised from `linear`; None as in `infer`."""
+    def rated(self, used: Bools, linear: Linear, shares: Floats) -> _Rated:
+        """All loops at the poses of one used loop (M,) of each place, optimised from `linear`."""
         rows, ends = np.flatnonzero(used), self.start.chain.places
         rows = rows[one_of_each_place(ends[rows])] if len(rows) else rows
-        reduced = thinned(self.start.chain, rows)
-        if not self.may_thin and len(reduced.active) < len(rows):
-            return None
-        fit = optimised(Fit(reduced, linear), MOST_STEPS)
+        fit = optimised(Fit(self.reduced(rows), linear), MOST_STEPS)
         judged = judge(fit.linear, fit, shares, self.outliers)
         shares, _ = mixture(judged.factor)
         return _Rated(np.minimum(judged.factor, judged.log_odds), shares, fit.linear)
 
-    def agreed(self, used: Bools, shares: Floats, linear: Linear) -> tuple[Bools, Judged, Linear] | None:
+    def reduced(self, rows: Ints) -> Reduced:
+        """The graph of these loops, of all where it may not be thinned."""
+        reduced = thinned(self.start.chain, rows)
+        if not self.may_thin and len(reduced.active) < len(rows):
+            raise _TooManyLoops
+        return reduced
+
+    def agreed(self, used: Bools, shares: Floats, linear: Linear) -> tuple[Bools, Judged, Linear]:
         """Loops (M,) that agree with the poses that they lead to, iterated from those `used (M,)` on; how all are
-        judged at the likeliest poses on the way; and these. None as in `infer`.
+        judged at the likeliest poses on the way; and these.
         """
         start, chain = self.start, self.start.chain
         best, top, seen = (self.alone, start), -np.inf, b""
         for number in range(ROUNDS):
-            rows = np.flatnonzero(used)
-            reduced = thinned(chain, rows)
-            if not self.may_thin and len(reduced.active) < len(rows):
-                return None
+            reduced = self.reduced(np.flatnonzero(used))
             fit = optimised(Fit(reduced, linear), MOST_STEPS)
             if not number and fit.cost > len(reduced.active) * len(chain.axes):
                 # more than right loops should leave: the descent may have ended in a local minimum
@@ -248,8 +242,6 @@ def _single_joins(chain: Chain, used: Bools) -> Bools:
     return lone
 
 
-REARRANGED = 3
-"""Times that the loops are judged, before and after places are left out: a limit on cost."""
 MOST_GROWN = 30
 """Rounds in which loops are added: a limit on cost."""
 
@@ -260,9 +252,9 @@ def refused(found: Inferred, trusted: Bools) -> Inferred:
     return replace(found, used=trusted.copy(), linear=found.start, reduced=reduced)
 
 
-BY_CHANCE, BY_CHANCE_EACH_FOLD = float(np.log(100.0)), 3.0
-"""Log-evidence that chance reaches in one graph of a hundred, and its increase with each e-fold of loops, measured with
-random loops in simulated graphs and in those of Bicocca and RobotCar, whose best reach half of it.
+BY_CHANCE_EACH_FOLD = 3.0
+"""Increase of the log-evidence that chance reaches with each e-fold of loops, measured with random loops in simulated
+graphs and in those of Bicocca and RobotCar, whose best reach half of it.
 """
 
 
@@ -274,10 +266,6 @@ def _agreeing(judged: Judged) -> Bools:
 def _limit(judged: Judged) -> float:
     """The log Bayes factor that one of the wrong loops is expected to reach by chance: log of their expected number."""
     return float(np.log(max(expit(-judged.log_odds).sum(), 1)))
-
-
-MISTAKEN = float(np.log(20.0))
-"""Log-odds of right places against mistaken ones that are enough."""
 
 
 def by_chance(count: int) -> float:

@@ -17,6 +17,8 @@ from hodge_pipeline.types import Bools, Floats, Ints
 
 NEIGHBOURS, SEEDS = 8, 16
 """Nearest loops that each loop is compared with, and seeds that are then compared with all: limits on cost."""
+LOOSE = 2.0
+"""Factor from the standard deviations of the one loop that a bridge follows from to those of the bridge."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,13 @@ class PairwiseConsistency:
         before = local(end, total[np.maximum(a, low)] - total[np.minimum(a, low)])
         after = local(poses[high], total[np.maximum(b, high)] - total[np.minimum(b, high)])
         return end, before + after + chain.carried(se3.inverse(from_end), chain.covariance[loop])
+
+    def bridge(self, loop: int, low: int, high: int) -> tuple[Floats, Floats]:
+        """The motion (4, 4) from position `low` to position `high` that a loop asks for, and its covariance (p, p)."""
+        end, covariance = self.predicted(np.array([loop]), np.array([low]), np.array([high]))
+        motion = se3.inverse(self.linear.poses[low]) @ end[0]
+        motion[:3, :3] = se3.project_to_so3(motion[:3, :3])  # else rounding doubles with each path
+        return motion, LOOSE**2 * covariance[0]
 
     def seeds(self, among: Ints) -> Iterator[tuple[int, Floats]]:
         """Unused loops that contradict each other, those first with which most others near them agree, all of one place

@@ -32,8 +32,8 @@ once would stay open: its loops can show little more than that the drift is as s
 """
 MOST_TRIED = 3
 """Places left out on trial each time: a limit on cost."""
-CLEARLY = float(np.log(20.0))
-"""Log-odds that a change must gain."""
+MISTAKEN = float(np.log(20.0))
+"""Log-odds of right places against mistaken ones that are enough, and that a change must gain."""
 FEW_ALIKE = 0.1
 """Share of the loops that must be unused and agree in groups of more than `PAIRED`, so that places do look alike, for
 the places of a corridor to count once; else each counts. Unused loops that agree with no other say nothing of
@@ -159,7 +159,7 @@ class Places:
         changes = self._changes(found)
         while changes:
             tried = self.arranged(changes.pop(0), found.fit.linear)
-            if tried.log_odds > found.log_odds + CLEARLY:
+            if tried.log_odds > found.log_odds + MISTAKEN:
                 found, changes = tried, self._changes(tried)
         return found
 

@@ -11,6 +11,7 @@ from hodge_pipeline.solvers.backbone.evidence import mahalanobis
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, optimised
 from hodge_pipeline.solvers.backbone.linear import Linear
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
+from hodge_pipeline.solvers.reweighted import SETTLED
 from hodge_pipeline.types import Floats
 
 LOCAL = 0.5
@@ -23,8 +24,6 @@ error in all.
 """
 ROUNDS, STEPS = 5, 3
 """Reweighting rounds, and Gauss–Newton steps in each: limits on cost."""
-SAME_WEIGHT = 0.01
-"""Largest change of a weight at which reweighting ends."""
 
 
 def polished(reduced: Reduced, linear: Linear) -> tuple[Linear, Floats]:
@@ -44,6 +43,6 @@ def polished(reduced: Reduced, linear: Linear) -> tuple[Linear, Floats]:
         chi2 = mahalanobis(residual, covariance * weights[rows, None, None])[0]
         before = weights[rows]
         weights[rows] = tail_weight(chi2, len(chain.axes))
-        if np.abs(weights[rows] - before).max() < SAME_WEIGHT:
+        if np.abs(weights[rows] - before).max() < SETTLED:
             break
     return linear, np.sqrt(wide / weights)

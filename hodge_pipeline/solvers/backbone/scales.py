@@ -12,6 +12,7 @@ from scipy.special import chdtri
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.credible import MOST_OF_A_STEP
 from hodge_pipeline.solvers.backbone.evidence import (
+    BY_CHANCE,
     EVEN,
     OutlierModel,
     OutlierResiduals,
@@ -26,8 +27,8 @@ from hodge_pipeline.types import Floats, Ints
 
 FOLD = np.log(4.0)
 """Prior standard deviation of the logarithm of a scale: stated information is seldom wrong by more."""
-FIRST, FINEST = np.log(4.0), np.log(2.0) / 2
-"""First and last step of the search, in the logarithm of a scale."""
+FINEST = np.log(2.0) / 2
+"""Last step of the search, in the logarithm of a scale; the first is `FOLD`."""
 MOST_RATIO = np.log(2.0)
 """Largest log-ratio of the scales of rotation and of translation, where information is stated."""
 SMALLER = np.log(4.0) * np.array([0, -1, -2])
@@ -40,8 +41,6 @@ them the scales of rotation and translation are independent where the informatio
 """
 FARTHEST = 3 * np.log(4.0)
 """Least distance of further starts from the stated scale: nearer ones would explain mistaken places."""
-LIKELIER_BY = float(np.log(100.0))
-"""Nats that a further start must gain over the stated scale."""
 DECOYS = 4
 """Decoys per loop: with one, scales of loops differed up to eightfold from one draw to the next."""
 SURPRISING = 2.5
@@ -137,9 +136,7 @@ def learned_scales(chain: Chain, outliers: OutlierModel) -> Iterator[tuple[Scale
     poses = chain.poses
     alone = _within(chain, np.arange(len(chain.ends)), chain.ends)
     of_decoys = _within(chain, *decoys(chain, DECOYS))
-    rows, ends = (np.concatenate(each) for each in zip(alone, of_decoys, strict=True))
-    models = _Model.within(chain.with_loops(rows, ends), poses, outliers)
-    own, elsewhere = models.select(slice(len(alone[0]))), models.select(slice(len(alone[0]), None))
+    own, elsewhere = (_Model.within(chain.with_loops(*each), poses, outliers) for each in (alone, of_decoys))
     both = [(own, elsewhere)]
     one, near = _neighbours(chain)
     if len(one):
@@ -163,7 +160,7 @@ def learned_scales(chain: Chain, outliers: OutlierModel) -> Iterator[tuple[Scale
     tried = tried[values[tried] > found[1]] if chain.stated else tried
     others = [_likeliest(value, unit) for unit in units[tried].tolist()]
     other = max(others, key=lambda each: each[1], default=found)
-    found = other if other[1] > found[1] + LIKELIER_BY else found
+    found = other if other[1] > found[1] + BY_CHANCE else found
 
     def learned(logs: Floats) -> tuple[Scales, Floats]:
         logs = np.minimum(logs, most)
@@ -215,7 +212,7 @@ def _likeliest(
     """The maximum of `value` by coordinate search from a common scale `start`, by default the unit: the logarithms (4,)
     of scales, and the value.
     """
-    best, width = np.full(4, unit if start is None else start), FIRST
+    best, width = np.full(4, unit if start is None else start), FOLD
     top = value(best, unit)
     while width >= FINEST:
         axis = still = 0
@@ -321,12 +318,6 @@ class _Model:
             return path, residuals(scaled)[1] - path
 
         return cls.of(chain, outliers, first, residuals(chain)[0], parted)
-
-    def select(self, rows: slice) -> _Model:
-        """The model of these cycles."""
-        away = self.outliers
-        outliers = OutlierResiduals(away.along[rows], away.spread[rows], away.squared[rows], away.apart[rows])
-        return _Model(outliers, self.residual[rows], self.fixed[rows], self.path[:, rows], self.own[:, rows])
 
     def value(self, logs: Floats) -> tuple[float, Floats]:
         """The log-likelihood of scales, against all loops being wrong, and the shares of right and wrong loops."""

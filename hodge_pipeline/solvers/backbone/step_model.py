@@ -1,42 +1,32 @@
-"""How the steps of a chain usually are: kinds of motions, and how rare each step is."""
+"""How the steps of a chain usually are, and how rare each step is."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from hodge_pipeline.complex.chi2 import tail_weight
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis
-from hodge_pipeline.solvers.backbone.linear import cholesky
-from hodge_pipeline.types import Bools, Floats
+from hodge_pipeline.types import Floats
 
 TAIL = 0.1
 """Share of the most unusual steps, to which the tail of the sizes is fitted (Hill 1975)."""
 ROUNDS, LEAST = 10, 1e-6
 """Reweighting rounds of `StepModel`, and the share of each variance that is added to it."""
-OF_ONE_KIND, FEWEST_OF_KIND = 3.0, 3
-"""Largest χ² per axis of a step of a kind, and fewest steps of a kind."""
-MOST_KINDS, MOST_COMPARED = 8, 2000
-"""Kinds, and steps compared with all others to find one: limits on cost."""
 
 
 @dataclass(frozen=True)
 class StepModel:
-    """A mixture of the motions of a chain's steps.
+    """The distribution of the motions of a chain's steps.
 
-    - `centres (K, 4, 4)`: of the kinds of steps, such as straight on and round a corner, the most frequent first;
-      `shares (K,)` of the steps; one `covariance (p, p)`; `kind (n,)`: which steps are of any of them.
-    - `unusual (n,)`: by how many nats each step is rarer, beside its nearest kind, than the rarest of as many should
-      be.
+    - `centre (4, 4)`: of the usual step; `covariance (p, p)`.
+    - `unusual (n,)`: by how many nats each step is rarer than the rarest of as many should be.
     """
 
-    centres: Floats
-    shares: Floats
+    centre: Floats
     covariance: Floats
-    kind: Bools
     unusual: Floats
 
     @classmethod
@@ -49,31 +39,25 @@ class StepModel:
         twist = chain.log(chain.step[rows])
         twist = np.concatenate([twist, twist @ _mirrored(chain, twist)])
         centre = np.median(twist, axis=0)
-        left = twist - centre
-        covariance = _student_covariance(left)
-        whiten = np.linalg.inv(cholesky(covariance[None])[0]).T
-        centres, shares, of_one = _kinds(left, left @ whiten)
-        chi2 = cKDTree(centres @ whiten).query(left @ whiten)[0] ** 2
+        covariance, chi2 = _student_covariance(twist - centre)
         unusual = np.full(chain.size, -np.inf)
         unusual[rows] = _rarity(chi2[: len(rows)]) - np.log(len(rows))
-        kind = np.zeros(chain.size, bool)
-        kind[rows] = of_one[: len(rows)]
-        return cls(chain.exp(centre + centres), shares, covariance, kind, unusual)
+        return cls(chain.exp(centre), covariance, unusual)
 
     def off(self, chain: Chain, motion: Floats) -> Floats:
-        """Twists (K, M, p) from each kind's centre to motions (M, 4, 4)."""
-        return chain.log(chain.between(self.centres[:, None], motion))
+        """Twists (M, p) from the centre to motions (M, 4, 4)."""
+        return chain.log(chain.between(self.centre, motion))
 
 
-def _student_covariance(left: Floats) -> Floats:
-    """The covariance (p, p) of residuals (M, p), with weights by Student's t."""
+def _student_covariance(left: Floats) -> tuple[Floats, Floats]:
+    """The covariance (p, p) of residuals (M, p), with weights by Student's t, and their χ² (M,)."""
     weight = np.ones(len(left))
     for _ in range(ROUNDS):
         covariance = (left * weight[:, None]).T @ left / len(left)
         covariance += np.diag(LEAST * np.diag(covariance) + np.finfo(float).tiny ** 0.5)
         chi2 = mahalanobis(left, np.broadcast_to(covariance, (len(left), *covariance.shape)))[0]
         weight = tail_weight(chi2, left.shape[1])
-    return covariance
+    return covariance, chi2
 
 
 def _rarity(chi2: Floats) -> Floats:
@@ -90,23 +74,3 @@ def _mirrored(chain: Chain, twist: Floats) -> Floats:
     ahead[chain.axes] = np.median(twist, axis=0)
     half = 2 * np.outer(ahead[3:], ahead[3:]) / max(float(ahead[3:] @ ahead[3:]), np.finfo(float).tiny) - np.eye(3)
     return np.asarray(np.kron(np.eye(2), half)[np.ix_(chain.axes, chain.axes)], float)
-
-
-def _kinds(left: Floats, white: Floats) -> tuple[Floats, Floats, Bools]:
-    """The centres (K, p) of kinds of steps, the share (K,) of each, and which steps (M,) are of one; `left (M, p)`:
-    twists about their median, `white (M, p)`: the same whitened.
-    """
-    size, gate = left.shape[1], OF_ONE_KIND * left.shape[1]
-    other = (white**2).sum(axis=1) > gate
-    centres, counts = [np.zeros(size)], [max(float((~other).sum()), 1.0)]
-    while other.sum() >= FEWEST_OF_KIND and len(centres) < MOST_KINDS:
-        rows = np.flatnonzero(other)
-        some = white[rows[:: -(-len(rows) // MOST_COMPARED)]]
-        near = cKDTree(some).query_ball_point(some, np.sqrt(gate), return_length=True)
-        alike = rows[((white[rows] - some[np.argmax(near)]) ** 2).sum(axis=1) <= gate]
-        if len(alike) < FEWEST_OF_KIND:
-            break
-        centres.append(np.median(left[alike], axis=0))
-        counts.append(float(len(alike)))
-        other[alike] = False
-    return np.stack(centres), np.array(counts) / len(left), ~other
