@@ -15,7 +15,7 @@ from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.complex.short_cycles import with_cycles_of
 from hodge_pipeline.diagnosis.consensus import agreeing, find_consensus, sought_from
 from hodge_pipeline.diagnosis.cycles import Cycles, close_by_chance, judge_cycles, witnesses
-from hodge_pipeline.diagnosis.evidence import Evidence, gather
+from hodge_pipeline.diagnosis.evidence import Evidence, every_pair_tried, gather
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.on_backbone import judged_on_backbone
 from hodge_pipeline.diagnosis.options import CONSISTENT_FROM, WRONG_BELOW, DiagnosisOptions
@@ -31,8 +31,8 @@ from hodge_pipeline.diagnosis.shared_blame import share_blame
 from hodge_pipeline.diagnosis.wording import reasons
 from hodge_pipeline.one_blas_thread import one_blas_thread
 from hodge_pipeline.solvers.backbone.lattice import lattice_backbone, steps_are_wrong
-from hodge_pipeline.solvers.backbone.sequence import sequential_edges, vertex_ranks
-from hodge_pipeline.solvers.backbone.step_tests import gate_of
+from hodge_pipeline.solvers.backbone.sequence import vertex_ranks
+from hodge_pipeline.solvers.backbone.step_tests import is_folded
 from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
 from hodge_pipeline.solvers.resistance import Network
 from hodge_pipeline.solvers.weights import OUT_OF_PLANE, dimension_of
@@ -60,6 +60,8 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
 def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbone | Diagnosis:
     """The backbone of a graph where one is trusted, else the diagnosis without one."""
     graph = replace(graph, dimension=dimension_of(graph))
+    if options.trust == AUTO and every_pair_tried(vertex_ranks(graph)[graph.edges], graph.vertex_count):
+        return _ByCycles.of(graph, options).found
     by_cycles = cache(partial(_ByCycles.of, graph, options))  # slow, and not every graph needs it
 
     def is_lattice(loops: Ints) -> bool:
@@ -108,23 +110,10 @@ class _ByCycles:
 
     @cached_property
     def explains_nothing(self) -> bool:
-        """Whether cycles close no better than by chance, see `close_by_chance`, or the solution is folded."""
-        known = self.evidence
-        return close_by_chance(self.cycles, known.graph.i_from_j, known.noise, known.reach_m) or self._is_folded
-
-    @property
-    def _is_folded(self) -> bool:
-        """Whether consecutive edges that count are off by a large part of both their displacement and their angle, by
-        the median: loops that join any two places then fold the sequence upon itself, and it counts as noise.
-        """
-        stated, found = self.stated, self.found
-        rows = np.flatnonzero(sequential_edges(stated) & found.kept)
-        if not len(rows):
-            return True
-        motion, poses = stated.i_from_j[rows], found.world_from_cam[stated.edges[rows]]
-        left = se3.inverse(motion) @ se3.inverse(poses[:, 0]) @ poses[:, 1]
-        off = np.linalg.norm(left[:, :3, 3], axis=1), se3.rotation_angle(left)
-        return bool((np.median(off, axis=1) > gate_of(motion)).all())
+        """Whether cycles close no better than by chance or the sequence is folded: `close_by_chance`, `is_folded`."""
+        known, found = self.evidence, self.found
+        by_chance = close_by_chance(self.cycles, known.graph.i_from_j, known.noise, known.reach_m)
+        return by_chance or is_folded(self.stated, found.kept, found.world_from_cam)
 
     @cached_property
     def fit(self) -> Solved:

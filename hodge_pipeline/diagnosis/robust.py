@@ -19,6 +19,7 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, backbone_or_diagnosis
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG, Diagnosis
+from hodge_pipeline.solvers.backbone.step_tests import is_folded
 from hodge_pipeline.solvers.backbone.trust import Backbone
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.reweighted import reweighted
@@ -145,22 +146,27 @@ def _kept_note(found: Diagnosis, weights: Floats) -> str:
 
 
 def _with_confirmation(graph: ViewGraph, usable: Bools, solution: Solution) -> Solution:
-    """The solution with `confirmed` set: whether cycles of its used edges close better than by chance.
+    """The solution with `confirmed` set: whether cycles of its used edges close better than by chance, and consecutive
+    edges are not folded; None where nothing tests the edges.
 
     Edges that no solve can use (not `usable (E,)`) do not count as left out.
     """
     weights = solution.weights[usable]
-    if closes_better_than_chance(graph.select(np.flatnonzero(usable)), np.flatnonzero(weights)):
+    if is_folded(graph, solution.weights > 0, solution.world_from_cam):
+        why = "consecutive edges are off by a large part of their own motion: the others fold the sequence upon itself"
+    elif closes_better_than_chance(graph.select(np.flatnonzero(usable)), np.flatnonzero(weights)):
         return replace(solution, confirmed=True)
-    if left_out := int((weights == 0).sum()):
+    elif left_out := int((weights == 0).sum()):
+        edges = counted(left_out, "edge is|edges are")
         why = (
-            f"{counted(left_out, 'edge is|edges are')} left out, and the cycles of the others close no better "
-            "than by chance"
+            f"{edges} left out, and the cycles of the others close no better than by chance: nothing confirms the poses"
         )
-        note = f"{why}: nothing confirms the poses"
-        return replace(solution, confirmed=False, notes=(note, *solution.notes))
-    note = "no edge is left out, and no cycles close better than by chance: nothing tests the edges"
-    return replace(solution, notes=(*solution.notes, note))
+    elif has_unit_information(graph) or is_explained(graph, solution):
+        note = "no edge is left out, and no cycles close better than by chance: nothing tests the edges"
+        return replace(solution, notes=(*solution.notes, note))
+    else:
+        why = "the edges disagree by more than they state, and no cycles close better than by chance"
+    return replace(solution, confirmed=False, notes=(why, *solution.notes))
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))

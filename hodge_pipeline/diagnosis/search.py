@@ -34,8 +34,9 @@ dominates.
 """
 MOST_PROPOSALS = 1000
 """Edges that propose a motion, the likeliest by the order of the views: a limit on cost."""
-LEAST_GAIN = 2.0
-"""Least gain of a move, nats."""
+LEAST_GAIN, LEAST_OF_FEW = 2.0, 0.7
+"""Least gain of a move, nats; and where not every pair was tried, so that few edges agree by chance: 2 edges against 1,
+4 against 2."""
 CUT_THROUGH = (3.0, 20.0)
 """Expected numbers of edges in a cut: linearised there, each edge costs PER_FOLD / (1 + number)."""
 PULL = 2.0
@@ -99,7 +100,8 @@ def _moves(here: Placements) -> list[Move]:
     together = max(TOGETHER // max(len(here.pairs), 1), 1)
     for first in range(0, len(tried), together):
         moves += _best_moves(here, Trial.of(here, proposals, tried[first : first + together]))
-    better = sorted((move for move in moves if move.gain > LEAST_GAIN), key=lambda move: -move.gain)
+    least = LEAST_GAIN if evidence.exhaustive else LEAST_OF_FEW
+    better = sorted((move for move in moves if move.gain > least), key=lambda move: -move.gain)
     return _independent(better, len(here.found.piece))
 
 

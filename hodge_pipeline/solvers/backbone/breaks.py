@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,10 +11,9 @@ from hodge_pipeline.complex.chi2 import FREEDOM, tail_weight
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis, student_log_density
 from hodge_pipeline.solvers.backbone.fit import Fit
 from hodge_pipeline.solvers.backbone.linear import linearise, turned
-from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.step_model import StepModel
-from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types import Floats, Ints
 
 PLATEAU = 12.0
 """Nats below the best step at which a step is no candidate for the break."""
@@ -30,7 +29,7 @@ class Break:
 
     - `motion (4, 4)` and `covariance (p, p)`: of the bridge in its place; `usual`: whether it is as steps usually are.
     - `log_evidence`: in nats, for the break.
-    - `share`: of the places that loops over the step join which the chain does not explain, those where they agree.
+    - `agreeing (K,)`: the loops that agree on it, which the chain does not explain; none where steps alone show it.
     """
 
     at: int
@@ -38,7 +37,7 @@ class Break:
     covariance: Floats
     log_evidence: float
     usual: bool = True
-    share: float = 1.0
+    agreeing: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 def agreed_breaks(pairwise: PairwiseConsistency, usual: StepModel) -> list[Break]:
@@ -60,18 +59,9 @@ def agreed_breaks(pairwise: PairwiseConsistency, usual: StepModel) -> list[Break
             far = _far_break(pairwise, seed, at[~fit], score[~fit])
             if chain.corridors_over(far.at, rows[(factor > 0) & (gain > 0)]) > 1:  # else no trial will show as many
                 found.append(far)
-        out += [replace(each, share=_share(pairwise, rows, factor > 0, each.at)) for each in found]
+        agreeing = rows[(factor > 0) & ~pairwise.used[rows]]
+        out += [replace(each, agreeing=agreeing[chain.passes(each.at, agreeing)]) for each in found]
     return sorted(out, key=lambda each: -each.log_evidence)
-
-
-def _share(pairwise: PairwiseConsistency, rows: Ints, agree: Bools, at: int) -> float:
-    """The share of the places joined by unused loops (rows) over a step, of those loops that `agree (K,)` and all."""
-    low, high = pairwise.chain.ends[rows].T
-    over = (low < at) & (at <= high) & ~pairwise.used[rows]
-    every, agreed = (
-        float((1 / loops_at_place(pairwise.chain.places[rows[each]])).sum()) for each in (over, over & agree)
-    )
-    return agreed / every if every else 1.0
 
 
 def _log_with_usual_step(pairwise: PairwiseConsistency, usual: StepModel, loop: Ints, at: Ints) -> Floats:

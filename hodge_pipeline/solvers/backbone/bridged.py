@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import compress
 
 import numpy as np
 
@@ -148,9 +149,12 @@ def _candidates(chain: Chain, found: Inferred, outliers: OutlierModel) -> list[t
     usual, least = StepModel.of(chain), by_chance(len(factor))
     fold = np.log(max((1 / loops_at_place(pairwise.chain.places)).sum(), 1))  # for the best of as many places
     agreed = [each for each in agreed_breaks(pairwise, usual) if each.log_evidence > BY_CHANCE + fold]
-    if any(each.share < CONTRADICTED for each in agreed):
-        nothing = max(_agreed_by_chance(pairwise, usual, shares, outliers)) + BY_CHANCE
-        agreed = [each for each in agreed if each.share >= CONTRADICTED or each.log_evidence > nothing]
+    doubtful = [_is_contradicted(pairwise, each) for each in agreed]
+    if any(doubtful):
+        others = np.ones(len(factor), bool)
+        others[np.concatenate([each.agreeing for each in compress(agreed, doubtful)])] = False
+        chance = list(_agreed_by_chance(pairwise, np.flatnonzero(others), usual, shares, outliers))
+        agreed = [each for each, doubt in zip(agreed, doubtful, strict=True) if not doubt or _is_likelier(each, chance)]
     far, agreed = [each for each in agreed if not each.usual], [each for each in agreed if each.usual]
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
     candidates = [(each, least) for each in agreed[:TRIED_AT_ONCE] if each is agreed[0] or each.at != agreed[0].at]
@@ -164,25 +168,42 @@ def _candidates(chain: Chain, found: Inferred, outliers: OutlierModel) -> list[t
     return candidates + [(each, least) for each in far[:1]]
 
 
-def _agreed_by_chance(
-    pairwise: PairwiseConsistency, usual: StepModel, shares: Floats, outliers: OutlierModel
-) -> Iterator[float]:
-    """The log-evidence of the likeliest break where the unused loops end at each other's upper ends, which tells how
-    much wrong ones agree by chance: in streets at right angles, or by motions that all say the same place, often.
+def _is_contradicted(pairwise: PairwiseConsistency, broken: Break) -> bool:
+    """Whether fewer than `CONTRADICTED` of the places of loops over a step that the chain does not explain agree on its
+    break.
     """
-    rng, chain, rows = np.random.default_rng(5), pairwise.chain, np.flatnonzero(~pairwise.used)
-    for _ in range(DRAWN):
-        ends = chain.ends.copy()
+    chain, rows = pairwise.chain, np.flatnonzero(~pairwise.used)
+    over = rows[chain.passes(broken.at, rows)]
+    agreed, every = (float((1 / loops_at_place(chain.places[each])).sum()) for each in (broken.agreeing, over))
+    return agreed < CONTRADICTED * every
+
+
+def _is_likelier(broken: Break, chance: list[Break]) -> bool:
+    """Whether a break is likelier than all of its kind that are due to chance."""
+    others = (each.log_evidence for each in chance if each.usual == broken.usual)
+    return broken.log_evidence > max(others, default=-np.inf) + BY_CHANCE
+
+
+def _agreed_by_chance(
+    pairwise: PairwiseConsistency, others: Ints, usual: StepModel, shares: Floats, outliers: OutlierModel
+) -> Iterator[Break]:
+    """The breaks by the loops `others (K,)` alone, of which those that the chain does not explain end at each other's
+    upper ends: they tell how much wrong loops agree by chance. In streets at right angles, or by motions that all say
+    the same place, they often do.
+    """
+    rng, chain, used = np.random.default_rng(5), pairwise.chain, pairwise.used[others]
+    log_wrong, by_chain, rows = pairwise.log_wrong[others], pairwise.by_chain[others], np.flatnonzero(~used)
+    for _ in range(DRAWN if len(rows) else 0):
+        ends = chain.ends[others]
         ends[rows, 1] = ends[rng.permutation(rows), 1]
-        ends = np.where(np.ptp(ends, axis=1)[:, None] > 0, np.sort(ends, axis=1), chain.ends)
-        linear = linearise(chain.with_loops(np.arange(len(ends)), ends), pairwise.linear.poses)
-        covariance = by_path(linear, rows)
-        log_wrong, by_chain = pairwise.log_wrong.copy(), pairwise.by_chain.copy()
-        log_wrong[rows] = outliers.at(linear.chain, rows, linear.loops[0][rows]).log_density(covariance)
-        factor = student_log_density(linear.loops[0][rows], covariance)[0] - log_wrong[rows]
+        ends = np.where(np.ptp(ends, axis=1)[:, None] > 0, np.sort(ends, axis=1), chain.ends[others])
+        linear = linearise(chain.with_loops(others, ends), pairwise.linear.poses)
+        covariance, residual = by_path(linear, rows), linear.loops[0][rows]
+        log_wrong[rows] = outliers.at(linear.chain, rows, residual).log_density(covariance)
+        factor = student_log_density(residual, covariance)[0] - log_wrong[rows]
         by_chain[rows] = np.logaddexp(shares[0] + factor, shares[1])
-        dealt = replace(pairwise, linear=linear, by_chain=by_chain, log_wrong=log_wrong)
-        yield max((each.log_evidence for each in agreed_breaks(dealt, usual)), default=-np.inf)
+        dealt = PairwiseConsistency(linear, by_chain, log_wrong, used)
+        yield from agreed_breaks(dealt, usual)
 
 
 def bridged(chain: Chain, broken: Break) -> Chain:

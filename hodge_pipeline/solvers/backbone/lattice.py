@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from scipy.stats import binom
-
 from hodge_pipeline.solvers.backbone.step_tests import StepCounts, is_tested, left_out_steps
 from hodge_pipeline.solvers.backbone.trust import FEW_BREAKS, Backbone, find_backbone
 from hodge_pipeline.types import Bools, Ints, ViewGraph
 
-UNCONTRADICTED, BY_CHANCE = 0.13, 0.05
-"""Share of the steps left out that no near loop contradicts where steps were measured wrong: up to this in simulated
-lattices of 200 to 1000 poses, 2 to 20 % of whose edges are wrong, with and without triangles; with groups of wrong loops
-.33 to 1. And the probability, by that share, of as many or more from which on such groups are not suspected.
-"""
-MOST_LEFT_OUT = 0.25
-"""Share of all steps left out from which on hundreds of wrong loops are suspected, which join near places and
-contradict steps beside them. In these lattices up to .2 are left out; with such loops .3 to .6.
+UNCONTRADICTED = 0.2
+"""Share of the steps left out that no near loop contradicts, from which on groups of wrong loops are suspected: a step
+that was measured wrong is contradicted by loops beside it. In simulated lattices of 200 to 1000 poses, 2 to 20 % of
+whose edges are wrong, with and without triangles, it is up to .13; with groups of wrong loops .33 to 1.
 """
 PLACES_PER_WRONG_STEP = 4.0
 """Number of mistaken places as likely as one wrong step that short cycles test and do not refute. In 28 simulated
@@ -40,11 +34,7 @@ def steps_are_wrong(graph: ViewGraph, kept: Bools, loops: Ints) -> bool:
 
 
 def _is_rival(found: StepCounts) -> bool:
-    return bool(binom.sf(found.uncontradicted - 1, found.left_out, UNCONTRADICTED) < BY_CHANCE)
-
-
-def _too_many(found: StepCounts) -> bool:
-    return found.left_out > MOST_LEFT_OUT * found.steps
+    return found.uncontradicted >= max(UNCONTRADICTED * found.left_out, 1)
 
 
 def lattice_backbone(graph: ViewGraph, kept: Bools, doubted: Backbone | None = None) -> tuple[Backbone | None, bool]:
@@ -52,20 +42,22 @@ def lattice_backbone(graph: ViewGraph, kept: Bools, doubted: Backbone | None = N
     explains more than these: it confirms loops of more places, or few places speak against it.
 
     It is a rival where the kept edges leave out steps that no near loop contradicts. A backbone that is `doubted` by
-    its own loops is also one where it explains enough, or where too many steps are left out for all to be wrong.
+    its own loops is also one where it explains enough, or where these leave out a step or two that its own search for
+    breaks refused.
     """
     if doubted is not None and _explains_enough(doubted, kept):
         return doubted, True
     found = left_out_steps(graph, kept)
     if doubted is not None and not doubted.found.confirmed and 0 < found.left_out < FEW_BREAKS:
-        return doubted, True  # breaks that its own search refused
+        return doubted, True
     if not _is_rival(found):
         return None, False
     backbone = doubted or find_backbone(graph, in_lattice=True)
     if backbone is None:
         return None, False
     for_it, against = backbone.places(backbone.used & ~kept), backbone.places(kept & ~backbone.used)
-    if (doubted or not backbone.found.confirmed) and against < PLACES_PER_WRONG_STEP * found.left_out:
+    unlikely = found.left_out if doubted or not backbone.found.confirmed else found.uncontradicted
+    if against < PLACES_PER_WRONG_STEP * unlikely:
         return backbone, True
     weight = PLACES_PER_WRONG_STEP if is_tested(backbone.chain) else 1.0
     return backbone, backbone.found.confirmed and weight * for_it > against

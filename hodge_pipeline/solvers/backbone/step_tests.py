@@ -62,6 +62,21 @@ def left_out_steps(graph: ViewGraph, kept: Bools) -> StepCounts:
     return StepCounts(int(uncontradicted.sum()), int(out.sum()), int(inner.sum()))
 
 
+def is_folded(graph: ViewGraph, kept: Bools, world_from_cam: Floats) -> bool:
+    """Whether consecutive edges among those `kept (E,)` are off by a large part of both their displacement and their
+    angle, by the median: loops that join any two places have then folded the sequence upon itself.
+    """
+    rows = np.flatnonzero(sequential_edges(graph) & kept)
+    if not len(rows):
+        return False
+    motion = graph.i_from_j[rows]
+    left = se3.inverse(motion) @ _between(world_from_cam, *graph.edges[rows].T)
+    off, moved = (
+        np.median([np.linalg.norm(each[:, :3, 3], axis=1), se3.rotation_angle(each)], axis=1) for each in (left, motion)
+    )
+    return bool((off >= moved / OF_STEPS).all())
+
+
 def agreeing_loops(chain: Chain, among: Bools) -> int:
     """How many of these loops (M,) agree with a neighbour: their cycle with another one whose ends are at most a step
     away closes within the gate, or within χ² by the covariance of its edges.
