@@ -71,8 +71,12 @@ def test_one_image_is_refused_alone_and_left_out_beside_others(sparse: Path) -> 
 
 def test_a_model_without_its_images_or_cameras_names_the_file_that_is_not_there(sparse: Path) -> None:
     (sparse / "0/images.bin").unlink()
+    left_out = f"left out: a COLMAP model without {sparse / '0/images.bin'}: copy that file too"
     (whole,) = ColmapModels().open_models(sparse)
-    assert f"left out: a COLMAP model without {sparse / '0/images.bin'}: copy that file too" in whole.notes
+    assert left_out in whole.notes
+    for folder in (sparse, sparse.parent):
+        opened = hodge_pipeline.open_source(folder)
+        assert len(opened.frames) == 8 and left_out in opened.notes
     assert not any("left out" in note for one in ColmapModels().open_models(sparse / "1") for note in one.notes)
     (sparse / "1/cameras.bin").unlink()
     for folder, name in (

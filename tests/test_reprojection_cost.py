@@ -17,7 +17,9 @@ from hodge_adapters.colmap.models import ColmapModels
 from hodge_adapters.colmap.uncertainty import information
 from hodge_pipeline import se3
 from hodge_pipeline.refine.reprojection_cost import best, costs, mends, spoilt_doubt
+from hodge_pipeline.refine.uncertainty import moves
 from hodge_pipeline.types import ModelQuality
+from hodge_pipeline.types.arrays import rms
 
 BEYOND_ANY_IMAGE_PX = 1e9
 Errors = dict[tuple[str, int], float]
@@ -161,6 +163,25 @@ def test_one_point_near_the_plane_of_a_camera_does_not_make_every_pose_uncertain
         for model in (ColmapModels(database="none", images="none").open_models([one])[0] for one in (right, wrong))
     )
     np.testing.assert_allclose(unsure, sure, rtol=0.05)
+
+
+def test_wrong_observations_make_poses_as_uncertain_as_they_pull_on_them(tmp_path: Path) -> None:
+    """5 % of the observations are wrong by 15 px: poses err by what their share of the squared residuals says."""
+    right = pycolmap.Reconstruction(noisy(tmp_path))
+    (true,), rng, errors, stated = ColmapModels(database="none").open_models([right]), np.random.default_rng(0), [], []
+    for _ in range(4):
+        wrong = pycolmap.Reconstruction(right)
+        for point in wrong.points3D.values():
+            for seen in point.track.elements:
+                if rng.random() < 0.05:
+                    keypoint = wrong.images[seen.image_id].points2D[seen.point2D_idx]
+                    keypoint.xy = keypoint.xy + 15.0 * rng.normal(size=2)
+        adjusted = ColmapModels(database="none").open_models([wrong])[0].adjusted()
+        errors.append(moves(true.world_from_body, adjusted.world_from_body)[:, 0])
+        stated.append(np.sqrt(3) * adjusted.information.standard_errors[:, 0])
+        robust = information(adjusted.records, adjusted.bodies, robust=True).standard_errors[:, 0]
+        assert (np.sqrt(3) * robust < 0.5 * stated[-1]).all()
+    assert 0.6 < rms(np.array(errors)) / rms(np.array(stated)) < 1.6
 
 
 def test_a_body_that_sees_nothing_does_not_make_the_others_uncertain(tmp_path: Path) -> None:

@@ -127,9 +127,8 @@ def find_models(path: Path) -> list[Path]:
     if model_ending(path):
         return [path]
     for place in (path, path / "sparse"):
-        below = [entry for entry in place.iterdir() if entry.is_dir()] if place.is_dir() else []
-        numbered = sorted((folder for folder in below if folder.name.isdecimal()), key=lambda folder: int(folder.name))
-        found = [folder for folder in numbered if model_ending(folder)]
+        below = [entry for entry in place.iterdir() if entry.name.isdecimal()] if place.is_dir() else []
+        found = [folder for folder in sorted(below, key=lambda folder: int(folder.name)) if model_ending(folder)]
         if found:
             return found
     single = find_model(path)

@@ -29,8 +29,8 @@ from hodge_adapters.colmap.files import (
     find_database,
     find_folder,
     find_images,
-    find_model,
     find_models,
+    incomplete_models,
     largest_model,
     no_model,
     part_of_model,
@@ -86,12 +86,12 @@ class ColmapReader:
     def sniff(self, path: Path) -> Sniff:
         """Sure of a folder with cameras and images in one of COLMAP's places."""
         try:
-            model = find_model(Path(path))
+            models = find_models(Path(path))
         except OSError:
             return Sniff(0.0, "not a folder that can be read")
-        if model is None:
+        if not models:
             return Sniff(0.0, "no cameras.bin and images.bin, nor .txt", part_of_model(Path(path)))
-        return Sniff(0.9, f"cameras and images in {model.name or model}")
+        return Sniff(0.9, f"cameras and images in {models[0].name or models[0]}")
 
     def open(self, path: Path) -> Source:
         """Images in natural order of their names as frames: id is the name, stamp the row, sequence the folder.
@@ -105,8 +105,9 @@ class ColmapReader:
         folder, several = largest_model(folders)
         source = self.source_of(path, folder, self._load(folder))
         told = (
-            (f"{several}: {folder.name} is taken, which has most; `hodge refine colmap` joins them",) if several else ()
+            [f"{several}: {folder.name} is taken, which has most; `hodge refine colmap` joins them"] if several else []
         )
+        told += [f"left out: {lack}" for lack in incomplete_models(path, folders)]
         return replace(source, notes=(*told, *source.notes))
 
     def _load(self, folder: Path) -> Model:

@@ -361,7 +361,7 @@ class ColmapModel:
     @cached_property
     def information(self) -> PoseInformation:
         """What the tracks tell of the bodies' poses; see `uncertainty.information`."""
-        return information(self.records, self.bodies)
+        return information(self.records, self.bodies, robust=self.robust)
 
     def held_out_errors(self, entries: Bools, adjusts: Adjusted) -> Floats:
         """Errors (H,) of these entries of tracks (T,) after an adjustment without them of nothing, the points or all.

@@ -39,11 +39,15 @@ class _Rows:
     point: Ints
 
 
-def information(model: Model, bodies: Bodies) -> PoseInformation:
+def information(model: Model, bodies: Bodies, *, robust: bool = False) -> PoseInformation:
     """What the tracks tell of the bodies' poses, whatever their points are.
 
-    From the size of the residuals; wrong observations (see `error_cap`) and points on a camera are left out. A body
-    with fewer than `LEAST_SEEN` observations takes no part: what is free beside the gauge would be mistaken for it.
+    From the derivatives of right observations (see `error_cap`) of points that are on no camera, and from the size of
+    all residuals of points that half of their observations fit: an adjustment without a `robust` loss is pulled by
+    wrong ones as far as they are off. By right ones alone its squared errors were 2.4 times as large as stated where
+    5 % are wrong and 1.4 times where 1 % are, now 1.8 and 1.1 times (medians of 370 to 570 small simulated models).
+    A body with fewer than `LEAST_SEEN` observations takes no part: what is free beside the gauge would be mistaken for
+    it.
     """
     errors_px, body = reprojection_errors(model), bodies.body_of_image[model.image_rows]
     right = (errors_px <= error_cap(errors_px)) & _are_apart(model)
@@ -53,9 +57,20 @@ def information(model: Model, bodies: Bodies) -> PoseInformation:
     freedom = 2 * int(used.sum()) - 6 * count - 3 * points + GAUGE
     if freedom <= 0 or not points:
         return PoseInformation(np.zeros(len(seen), bool), np.zeros((0, 6, 6)))
-    variance = max(float((errors_px[used] ** 2).sum()) / freedom, np.finfo(float).tiny)
+    fitting = _of_fitting_points(model, right) & np.isfinite(errors_px)
+    pulling = errors_px[used if robust else used | fitting]
+    variance = max(float(np.mean(pulling**2)) * int(used.sum()) / freedom, np.finfo(float).tiny)
     schur = _schur(model, bodies, used, np.cumsum(seen) - 1, count)
     return PoseInformation(seen, (schur[None] if schur.ndim == 2 else schur) / variance)
+
+
+def _of_fitting_points(model: Model, right: Bools) -> Bools:
+    """Which entries of tracks (T,) are of points that at least half of their observations, the `right` (T,), fit: one
+    near the plane of a camera may be left with errors of any size, and fits none.
+    """
+    owners = model.points.owners
+    seen, fits = np.bincount(owners), np.bincount(owners, right)
+    return np.asarray((2 * fits >= seen)[owners])
 
 
 def _are_apart(model: Model) -> Bools:
