@@ -78,6 +78,14 @@ def test_a_sweep_that_cannot_be_aligned_tells_nothing_of_how_far_the_scanner_wen
     assert loose == [False, False, True, False]
 
 
+def test_two_sweeps_of_one_stamp_tell_nothing_of_the_velocity() -> None:
+    tracker = ScanToMap(0.8, np.array([0, 0, 0, SPEED_M_S, 0, 0]))
+    clouds = [cast(Callable[[], PointCloud], street()[row].read_points)() for row in (0, 1)]
+    tracker.follow(clouds[0], 0.0)
+    tracker.follow(clouds[1], REVOLUTION_S)
+    assert tracker.place(clouds[1], REVOLUTION_S).weak == pytest.approx(np.eye(3))
+
+
 def test_coarse_voxels_align_only_sweeps_that_fit_less_than_usual_where_they_are_predicted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -134,7 +142,7 @@ def test_a_velocity_beyond_those_of_sweeps_that_held_goes_back_where_the_alignme
     tracker, ahead, few = ScanToMap(0.2, np.zeros(6)), np.eye(6)[3], PointCloud(np.ones((1, 3), np.float32))
 
     def after(velocity: Floats, weak: Floats) -> Floats:
-        tracker.accept(Placed(np.eye(4), 0.0, velocity, np.eye(3), 0.1, False, 1.0, weak))
+        tracker.accept(Placed(np.eye(4), 0.0, velocity, np.eye(3), 0.1, False, 1.0, weak, np.zeros(3)))
         return tracker.place(few, REVOLUTION_S).velocity
 
     for speed in (1.0, 2.0) * 5:
@@ -169,7 +177,9 @@ def test_a_sweep_that_turns_on_joins_the_map_as_it_was_aligned_so(monkeypatch: p
 
     def placed(_: PointCloud, __: float, velocity: Floats) -> Placed:
         tracker._map.latest = tracker._map.latest._replace(share=float(velocity[2]))
-        return Placed(np.eye(4), 0.0, velocity, np.eye(3), 0.1, False, 0.5 + 0.1 * velocity[2], np.zeros((3, 3)))
+        return Placed(
+            np.eye(4), 0.0, velocity, np.eye(3), 0.1, False, 0.5 + 0.1 * velocity[2], np.zeros((3, 3)), np.zeros(3)
+        )
 
     monkeypatch.setattr(tracker, "_placed", placed)
     assert tracker.place(PointCloud(np.zeros((0, 3), np.float32)), 0.0).on_map == 0.6

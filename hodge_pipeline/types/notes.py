@@ -69,8 +69,8 @@ DOUBTS = {
     "frames outside": "{count} of {detail} frames are from before the first given pose or after the last one: are they "
     "of another clock, or another path?",
     "path loose": "The length of the path is in doubt: {count} of {detail} sweeps {count:tells|tell} little of how "
-    "far the scanner went, as on a bare field, and it goes on as before there. Known positions (positions.path) would "
-    "hold it.",
+    "far the scanner went, as on a bare field or along a bare corridor: it goes on as before there, or slides. A wider "
+    "field of view, or known positions (positions.path), would hold it.",
     "not placed": "{detail}",
     "unsettled": "The result is not to be trusted: the last round still moved the cameras by {detail}, so the "
     "registered pairs do not agree on one scene. Frames nearer to each other, or more texture, would help.",
@@ -111,7 +111,7 @@ LOOKS = {
     "sweeps left out": "{count} {count:sweep is|sweeps are} left out, and posed by neighbours where these are known; "
     "the first: {detail}",
     "sweeps loose": "{count} of {detail} sweeps {count:tells|tell} little of how far the scanner went, as in a "
-    "tunnel, and it goes on as before",
+    "tunnel, and it goes on as before there, or slides",
     "sweeps uneven": "the path jumps at {count} {count:sweep|sweeps}, farther off the motion of the sweeps around "
     "{count:it|them} than these are ({detail}): its steps there may be off by as much, as where objects move or points "
     "have no times",
