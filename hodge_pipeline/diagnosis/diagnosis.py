@@ -30,9 +30,10 @@ from hodge_pipeline.diagnosis.robust_poses import Solved
 from hodge_pipeline.diagnosis.shared_blame import share_blame
 from hodge_pipeline.diagnosis.wording import reasons
 from hodge_pipeline.one_blas_thread import one_blas_thread
+from hodge_pipeline.solvers.backbone.chain import make_chain
 from hodge_pipeline.solvers.backbone.lattice import lattice_backbone, steps_are_wrong
-from hodge_pipeline.solvers.backbone.sequence import vertex_ranks
-from hodge_pipeline.solvers.backbone.step_tests import is_folded
+from hodge_pipeline.solvers.backbone.sequence import sequential_edges, vertex_ranks
+from hodge_pipeline.solvers.backbone.step_tests import is_folded, is_tested
 from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
 from hodge_pipeline.solvers.resistance import Network
 from hodge_pipeline.solvers.weights import OUT_OF_PLANE, dimension_of
@@ -60,7 +61,7 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
 def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbone | Diagnosis:
     """The backbone of a graph where one is trusted, else the diagnosis without one."""
     graph = replace(graph, dimension=dimension_of(graph))
-    if options.trust == AUTO and every_pair_tried(vertex_ranks(graph)[graph.edges], graph.vertex_count):
+    if options.trust == AUTO and _is_room(graph):
         return _ByCycles.of(graph, options).found
     by_cycles = cache(partial(_ByCycles.of, graph, options))  # slow, and not every graph needs it
 
@@ -81,6 +82,16 @@ def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbo
         return backbone or judged.found
     # groups of wrong loops may have torn the solution apart, which the poses of the backbone hold together
     return judged.sought_from(backbone.world_from_cam) if backbone.found.confirmed else judged.found
+
+
+def _is_room(graph: ViewGraph) -> bool:
+    """Whether registration seems to have been tried on all pairs, and short cycles test most consecutive edges: many
+    wrong loops of a short sequence join as many pairs.
+    """
+    if not every_pair_tried(vertex_ranks(graph)[graph.edges], graph.vertex_count):
+        return False
+    steps = sequential_edges(graph)
+    return not steps.any() or is_tested(make_chain(graph, steps))
 
 
 @dataclass(frozen=True)
