@@ -192,7 +192,7 @@ def test_what_nothing_confirms_is_said_first_and_fails(tmp_path):
     done = CliRunner().invoke(app, ["solve", str(tmp_path / "random.g2o"), "--robust"])
     assert isinstance(done.exception, CheckError) and done.exception.exit_code == 3
     assert "nothing confirms the result" in str(done.exception)
-    assert done.stdout.startswith("verdict  Solved, but NOT CONFIRMED by any cycle of its edges: ")
+    assert done.stdout.startswith("verdict  Solved, but NOT CONFIRMED by the cycles of its edges: ")
     plain = json.loads(CliRunner().invoke(app, ["solve", str(tmp_path / "random.g2o"), "--robust", "--json"]).stdout)
     assert plain["confirmed"] is False
     tree = graph.select(np.array([0]))

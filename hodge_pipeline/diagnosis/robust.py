@@ -47,8 +47,8 @@ def solve_robust(
     `diagnosis`: how the edges are judged, and which are trusted as a backbone. Where the information explains the
     residuals of the kept edges, the poses are their maximum-likelihood ones; else kept edges have weights by Student's
     t, 0 beyond the gate of `student_weight`. The graph's fixed vertices stay at their start. Components are those of
-    the kept edges. `confirmed` is False where edges are left out and the cycles of the others close no better than by
-    chance.
+    the kept edges. `confirmed` is False where edges are left out, or disagree by more than they state, and the cycles
+    of the others close no better than by chance; and where consecutive edges are folded.
     """
     check_choice("objective", objective, ObjectiveName)
     start = None if start is None else np.asarray(start, float)

@@ -78,7 +78,7 @@ class SolvedFile:
         """Why the poses are not to be trusted; "" where nothing speaks against them."""
         solution = self.solution
         if solution.confirmed is False:
-            return "NOT CONFIRMED by any cycle of its edges"
+            return "NOT CONFIRMED by the cycles of its edges"
         if solution.certified is False:
             return "NOT proven to be the global minimum"
         return "" if solution.converged is not False else "stopped before it converged"

@@ -34,13 +34,13 @@ MOST_BREAKS, TRIED_AT_ONCE = 10, 2
 
 
 CONTRADICTED = 1 / 3
-"""Share of the loops at the places of used ones that must be used: with fewer, these are compared with motions drawn at
-random, which takes three times as long as all else. In parts of four graphs of the literature by chance .08 to .35
-agree, but for one of .5; of right ones .47 to .64 where 60 % of the motions are wrong, .21 to .35 where 90 % are; of
-RobotCar's .39, .48.
+"""Share of the loops at the places of used ones that must be used, and of the places of loops over a step that must
+agree on its break: with fewer, these are compared with motions, or ends, drawn at random, which takes three times as
+long as all else. In parts of four graphs of the literature by chance .08 to .35 agree, but for one of .5; of right ones
+.47 to .64 where 60 % of the motions are wrong, .21 to .35 where 90 % are; of RobotCar's .39, .48.
 """
 DRAWN = 3
-"""Times that the motions of all loops are drawn at random."""
+"""Times that the motions, or the ends, of loops are drawn at random."""
 
 
 def infer_bridged(

@@ -64,17 +64,18 @@ def left_out_steps(graph: ViewGraph, kept: Bools) -> StepCounts:
 
 def is_folded(graph: ViewGraph, kept: Bools, world_from_cam: Floats) -> bool:
     """Whether consecutive edges among those `kept (E,)` are off by a large part of both their displacement and their
-    angle, by the median: loops that join any two places have then folded the sequence upon itself.
+    angle, on half of the path: loops that join any two places have then folded the sequence upon itself.
+
+    Of the path, not of the steps: where the sequence stands still, errors are all of a step.
     """
     rows = np.flatnonzero(sequential_edges(graph) & kept)
-    if not len(rows):
-        return False
     motion = graph.i_from_j[rows]
     left = se3.inverse(motion) @ _between(world_from_cam, *graph.edges[rows].T)
     off, moved = (
-        np.median([np.linalg.norm(each[:, :3, 3], axis=1), se3.rotation_angle(each)], axis=1) for each in (left, motion)
+        np.stack([np.linalg.norm(each[:, :3, 3], axis=1), se3.rotation_angle(each)]) for each in (left, motion)
     )
-    return bool((off >= moved / OF_STEPS).all())
+    on_path = (moved * (off >= moved / OF_STEPS)).sum(axis=1)
+    return bool(moved.any() and (on_path >= moved.sum(axis=1) / 2).all())
 
 
 def agreeing_loops(chain: Chain, among: Bools) -> int:
