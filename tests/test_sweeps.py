@@ -186,6 +186,43 @@ def test_a_sweep_that_turns_on_joins_the_map_as_it_was_aligned_so(monkeypatch: p
     assert tracker._map.latest.share == 1.0
 
 
+@pytest.mark.parametrize(
+    ("next_turn", "most_on_map", "turn", "rounds"),
+    [
+        pytest.param(lambda turn: 1 + turn / 2, 0.0, 1.9375, 5, id="settles slowly"),
+        pytest.param(lambda turn: 2 - 1.1 * turn, 0.0, -0.2, 2, id="alternates, the last round fits"),
+        pytest.param(lambda turn: 2 - 1.1 * turn, 2.0, 2.0, 2, id="alternates, the first round fits"),
+    ],
+)
+def test_a_sweep_is_deskewed_until_its_turn_settles_or_the_best_round_stands_where_it_swings(
+    next_turn: Callable[[float], float], most_on_map: float, turn: float, rounds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`next_turn`: the turn found by that it was deskewed by, radians a second; points are 20 m away."""
+    tracker, rates = ScanToMap(0.2, np.zeros(6)), list[float]()
+    tracker.accept(
+        Placed(np.eye(4), -REVOLUTION_S, np.zeros(6), 1e-6 * np.eye(3), 0.1, False, 1.0, np.zeros((3, 3)), np.zeros(3))
+    )
+    cloud = PointCloud(np.full((9, 3), 20 / np.sqrt(3), np.float32), times_s=np.linspace(0, 0.1, 9, dtype=np.float32))
+
+    def deskewed_by(cloud: PointCloud, rate: Floats, _: float) -> PointCloud:
+        rates.append(float(rate[2]))
+        return cloud
+
+    def align(*_: object) -> tuple[Floats, Floats]:
+        found = next_turn(rates[-1])
+        tracker._map.latest = tracker._map.latest._replace(share=found)
+        return se3.exp(np.eye(6)[2] * found * REVOLUTION_S), 1e6 * np.eye(6)
+
+    monkeypatch.setattr(scan_to_map, "deskewed", deskewed_by)
+    monkeypatch.setattr(tracker._map, "align", align)
+    monkeypatch.setattr(
+        tracker._map, "share_at", lambda pose: 1 - abs(se3.log(pose)[2] / REVOLUTION_S - most_on_map) / 9
+    )
+    assert tracker.place(cloud, 0.0).velocity[2] == pytest.approx(turn, abs=1e-3)
+    assert len(rates) == rounds
+    assert tracker._map.latest.share == pytest.approx(turn, abs=1e-3)
+
+
 def test_a_sweep_off_the_even_motion_around_it_is_named() -> None:
     frames, side = street().copy(), np.array([0, 0.4, 0], np.float32)
     frames[13] = changed(frames[13], lambda cloud: replace(cloud, points_in_cam=cloud.points_in_cam + side))

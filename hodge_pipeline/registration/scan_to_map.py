@@ -66,8 +66,10 @@ SHARED_ERRORS = 30.0
 """Factor on the sigma of a pose that independent points would give: points of a ring or wall share their errors. In a
 simulated corridor steps of 16 beams scattered by 0.1 m and claimed 3 mm.
 """
-MOST_DESKEWS, FARTHER = 3, 0.9
-"""A sweep is deskewed again while its new velocity moves its farther points, at this quantile, by half a voxel."""
+MOST_DESKEWS, FARTHER = 10, 0.9
+"""A sweep is deskewed again while its new velocity moves its farther points, at this quantile, by half a voxel, and by
+less each time. The rounds are a limit on time: most sweeps take one, and few more than three.
+"""
 
 
 class Step(NamedTuple):
@@ -154,16 +156,20 @@ class ScanToMap:
         return step
 
     def _placed(self, cloud: PointCloud, time_s: float, velocity: Floats) -> Step:
-        """The sweep placed, expected to move with this velocity (6,)."""
+        """The sweep placed, expected to move with this velocity (6,).
+
+        It is deskewed by the velocity found until that settles. Where a fast turn sets in, two velocities may lead to
+        each other without end: where the changes no longer shrink, the round with most points on the map stands.
+        """
         turn_s = 0.0 if cloud.times_s is None else float(cloud.times_s.max())
         duration = 0.0 if self._time_s is None else time_s - self._time_s
         velocity, spread = self._expected(velocity, self.spread + (ACCELERATION_M_S2 * duration) ** 2 * np.eye(3))
-        before, rates, moved_spread = self.pose, [velocity], spread
+        before, moved_spread, shift_m = self.pose, spread, np.inf
         weak, weakest = np.eye(3), np.zeros(3)  # of the velocity two sweeps of one stamp tell nothing
         predicted = before @ se3.exp(velocity * duration)
-        far_m = _far_m(cloud.points_in_cam)
+        far_m, rounds = _far_m(cloud.points_in_cam), list[tuple[Step, _Latest]]()
         for _ in range(MOST_DESKEWS):
-            points = deskewed(cloud, rates[-1], turn_s / 2).points_in_cam.astype(np.float64)
+            points = deskewed(cloud, velocity, turn_s / 2).points_in_cam.astype(np.float64)
             guesses = [before @ se3.exp(velocity * duration)]
             if _shift_m(velocity, far_m, abs(duration)) > self._coarsest_m:
                 guesses.append(before)  # after a gap the scanner may be where it was
@@ -171,19 +177,25 @@ class ScanToMap:
             pose, information = self._map.align(points, guesses, partial(_surprise, predicted, moves_m2))
             is_loose = information is None and self._time_s is not None
             if information is None or not duration:
-                break
+                on_map = np.nan if information is None else self._map.share_at(pose)
+                return Step(pose, time_s, velocity, moved_spread, turn_s, is_loose, on_map, weak, weakest)
             known, axes = np.linalg.eigh(information[3:, 3:])
             weak = axes * (known * (ACCELERATION_M_S2 * duration**2) ** 2 < 1) @ axes.T
             weakest = axes[:, 0] * (known[0] < WEAKEST * known.sum())
             is_loose = bool(known[0] < LOOSE * known.sum())
             pose, moved = _kalman_update(predicted, moves_m2, pose, information)
             moved_spread = moved / duration**2
-            velocity = se3.log(se3.inverse(before) @ pose) / duration
-            rates.append(velocity)
-            if not turn_s or _shift_m(rates[-1] - rates[-2], far_m, turn_s / 2) < self._voxel_m / 2:
+            rate, velocity = velocity, se3.log(se3.inverse(before) @ pose) / duration
+            on_map = self._map.share_at(pose)
+            step = Step(pose, time_s, velocity, moved_spread, turn_s, is_loose, on_map, weak, weakest)
+            rounds.append((step, self._map.latest))
+            last_m, shift_m = shift_m, _shift_m(velocity - rate, far_m, turn_s / 2)
+            if shift_m < self._voxel_m / 2:
+                return step
+            if shift_m >= last_m:
                 break
-        on_map = self._map.share_at(pose) if information is not None else np.nan
-        return Step(pose, time_s, velocity, moved_spread, turn_s, is_loose, on_map, weak, weakest)
+        step, self._map.latest = max(rounds, key=lambda one: one[0].on_map)
+        return step
 
     def _expected(self, velocity: Floats, spread: Floats) -> tuple[Floats, Floats]:
         """A velocity (6,) and the covariance (3, 3) of its translation, along weak directions drawn back to the
