@@ -91,6 +91,15 @@ def test_wrong_steps_and_wrong_edges_of_a_window_are_named() -> None:
     assert made.error_m(found.world_from_cam) < 0.5 * made.error_m(made.odometry())
 
 
+def test_a_window_is_judged_by_the_errors_that_it_shows_not_by_larger_ones_that_it_states() -> None:
+    made, off = with_window(drive(count=150, loops=0, wrong=0), 3, wrong=0.03)
+    graph, steps = made.graph, np.array([40, 90])
+    motions = graph.i_from_j.copy()
+    motions[steps] = motions[steps] @ se3.exp(np.array([0, 0, 0.1, 0.5, -0.3, 0]))
+    found = windowed(whole(replace(graph, i_from_j=motions, information=graph.information / 10.0**2)))
+    assert sorted(found.contradicted) == sorted([*steps, *off])
+
+
 def test_a_break_under_all_of_the_window_is_found_by_the_loops() -> None:
     """A robot that is carried off: what passes over that step errs alike."""
     made, _ = with_window(drive(wrong=0.3, loops=80), 3)

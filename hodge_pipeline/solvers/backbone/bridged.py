@@ -14,12 +14,7 @@ from hodge_pipeline.solvers.backbone.breaks import Break, Runs, agreed_breaks, u
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mixture, student_log_density
 from hodge_pipeline.solvers.backbone.fit import Fit, optimised
-from hodge_pipeline.solvers.backbone.inference import (
-    Inferred,
-    by_chance,
-    infer,
-    refused,
-)
+from hodge_pipeline.solvers.backbone.inference import Inferred, by_chance, infer, refused
 from hodge_pipeline.solvers.backbone.judge import by_path
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
@@ -31,8 +26,6 @@ from hodge_pipeline.types import Bools, Floats, Ints
 
 MOST_BREAKS, TRIED_AT_ONCE = 10, 2
 """Breaks that are bridged one after the other, and that are tried each time."""
-
-
 CONTRADICTED = 1 / 3
 """Share of the loops at the places of used ones that must be used, and of the places of loops over a step that must
 agree on its break: with fewer, these are compared with motions, or ends, drawn at random, which takes three times as
@@ -74,7 +67,7 @@ def infer_bridged(
         as_stated = _as_stated(chain, found, judge)
     # a break found by unconfirmed loops is not confirmed either
     for one, other in [(chain, found)] if found is first else [(chain, found), (unbroken, first)]:
-        if other.confirmed and not (_contradicted(other) and _found_by_chance(one, other, trusted, judge)):
+        if other.confirmed and not (_contradicted(other) and _random_motions_do_as_well(one, other, trusted, judge)):
             return one, other
     return unbroken, refused(first, trusted)
 
@@ -85,7 +78,9 @@ def _contradicted(found: Inferred) -> bool:
     return bool(loops_at_place(places[used]).sum() < CONTRADICTED * loops_at_place(places)[used].sum())
 
 
-def _found_by_chance(chain: Chain, found: Inferred, trusted: Bools, judge: Callable[..., Inferred | None]) -> bool:
+def _random_motions_do_as_well(
+    chain: Chain, found: Inferred, trusted: Bools, judge: Callable[..., Inferred | None]
+) -> bool:
     """Whether loops between the same places reach as much log-evidence with motions drawn from a normal distribution as
     wide as that of the measured ones; those of `trusted (M,)` loops stay.
     """
@@ -153,7 +148,7 @@ def _candidates(chain: Chain, found: Inferred, outliers: OutlierModel) -> list[t
     if any(doubtful):
         others = np.ones(len(factor), bool)
         others[np.concatenate([each.agreeing for each in compress(agreed, doubtful)])] = False
-        chance = list(_agreed_by_chance(pairwise, np.flatnonzero(others), usual, shares, outliers))
+        chance = list(_breaks_by_chance(pairwise, np.flatnonzero(others), usual, shares, outliers))
         agreed = [each for each, doubt in zip(agreed, doubtful, strict=True) if not doubt or _is_likelier(each, chance)]
     far, agreed = [each for each in agreed if not each.usual], [each for each in agreed if each.usual]
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
@@ -184,7 +179,7 @@ def _is_likelier(broken: Break, chance: list[Break]) -> bool:
     return broken.log_evidence > max(others, default=-np.inf) + BY_CHANCE
 
 
-def _agreed_by_chance(
+def _breaks_by_chance(
     pairwise: PairwiseConsistency, others: Ints, usual: StepModel, shares: Floats, outliers: OutlierModel
 ) -> Iterator[Break]:
     """The breaks by the loops `others (K,)` alone, of which those that the chain does not explain end at each other's

@@ -34,11 +34,10 @@ def is_tested(chain: Chain) -> bool:
 
 
 class StepCounts(NamedTuple):
-    """How many steps are left out and no near loop contradicts, are left out, and are there."""
+    """How many steps are left out and no near loop contradicts, and how many are left out at all."""
 
     uncontradicted: int
     left_out: int
-    steps: int
 
 
 def left_out_steps(graph: ViewGraph, kept: Bools) -> StepCounts:
@@ -59,7 +58,7 @@ def left_out_steps(graph: ViewGraph, kept: Bools) -> StepCounts:
         near += [two[(low == 1) & (high == 0), :, 0], two[(low == 0) & (high == 1), :, 1]]
     out = inner & left_out
     uncontradicted = out & (chain.over(np.concatenate(near)) == 0)
-    return StepCounts(int(uncontradicted.sum()), int(out.sum()), int(inner.sum()))
+    return StepCounts(int(uncontradicted.sum()), int(out.sum()))
 
 
 def is_folded(graph: ViewGraph, kept: Bools, world_from_cam: Floats) -> bool:

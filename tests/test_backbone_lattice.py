@@ -1,0 +1,66 @@
+"""What speaks for a backbone where cycles leave some of its steps out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hodge_pipeline.solvers.backbone.lattice import lattice_backbone
+from hodge_pipeline.solvers.backbone.step_tests import left_out_steps
+from hodge_pipeline.solvers.backbone.trust import Backbone, find_backbone
+from hodge_pipeline.types import Bools, Ints, ViewGraph
+from tests.backbone_graphs import drive
+
+STEPS = 119
+
+
+@pytest.fixture(scope="module")
+def graph() -> ViewGraph:
+    """A ring with 20 right loops, 20 wrong ones, and short ones over some of the steps."""
+    return drive(count=STEPS + 1, loops=40, wrong=0.5, short=20).graph
+
+
+@pytest.fixture(scope="module")
+def backbone(graph: ViewGraph) -> Backbone:
+    found = find_backbone(graph, in_lattice=True)
+    assert found is not None and found.found.confirmed
+    return found
+
+
+def without(graph: ViewGraph, steps: Ints) -> Bools:
+    return ~np.isin(np.arange(graph.edge_count), steps)
+
+
+@pytest.fixture(scope="module")
+def by_contradiction(graph: ViewGraph) -> tuple[Ints, Ints]:
+    """Every third step: those that nothing near contradicts where it is left out, and the others."""
+    steps = np.arange(1, STEPS, 3)
+    free = np.array([left_out_steps(graph, without(graph, steps[k : k + 1])).uncontradicted for k in range(len(steps))])
+    return steps[free == 1], steps[free == 0]
+
+
+@pytest.mark.parametrize(("free", "contradicted", "stands"), [(2, 0, True), (1, 4, False)])
+def test_steps_left_out_that_nothing_near_contradicts_speak_for_a_confirmed_backbone(
+    graph: ViewGraph,
+    backbone: Backbone,
+    by_contradiction: tuple[Ints, Ints],
+    free: int,
+    contradicted: int,
+    stands: bool,
+) -> None:
+    kept = without(graph, np.concatenate([by_contradiction[0][:free], by_contradiction[1][::4][:contradicted]]))
+    assert left_out_steps(graph, kept)[:2] == (free, free + contradicted)
+    assert 4 < backbone.places(kept & ~backbone.used) < 8
+    assert lattice_backbone(graph, kept)[1] == stands
+
+
+def test_a_step_or_two_that_few_unconfirmed_loops_leave_out_are_odometry(
+    graph: ViewGraph, backbone: Backbone, by_contradiction: tuple[Ints, Ints]
+) -> None:
+    doubted = replace(backbone, found=replace(backbone.found, confirmed=False))
+    most_loops = np.flatnonzero(~backbone.steps)[10:]
+    for count, loops, stands in ((0, most_loops, False), (1, most_loops, True), (2, most_loops, True), (1, [], False)):
+        kept = without(graph, np.append(by_contradiction[1][::4][:count], loops))
+        assert lattice_backbone(graph, kept, doubted) == ((doubted, True) if stands else (None, False))
