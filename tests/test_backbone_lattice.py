@@ -54,13 +54,3 @@ def test_steps_left_out_that_nothing_near_contradicts_speak_for_a_confirmed_back
     assert left_out_steps(graph, kept)[:2] == (free, free + contradicted)
     assert 4 < backbone.places(kept & ~backbone.used) < 8
     assert lattice_backbone(graph, kept)[1] == stands
-
-
-def test_a_step_or_two_that_few_unconfirmed_loops_leave_out_are_odometry(
-    graph: ViewGraph, backbone: Backbone, by_contradiction: tuple[Ints, Ints]
-) -> None:
-    doubted = replace(backbone, found=replace(backbone.found, confirmed=False))
-    most_loops = np.flatnonzero(~backbone.steps)[10:]
-    for count, loops, stands in ((0, most_loops, False), (1, most_loops, True), (2, most_loops, True), (1, [], False)):
-        kept = without(graph, np.append(by_contradiction[1][::4][:count], loops))
-        assert lattice_backbone(graph, kept, doubted) == ((doubted, True) if stands else (None, False))

@@ -16,11 +16,6 @@ PLACES_PER_WRONG_STEP = 4.0
 graphs of a right odometry and 100 to 800 right edges over two to four steps, with 40 loops of mistaken places, these
 are up to 2.3 times as many, but for four of the graphs. In a lattice none is tested so.
 """
-EXPLAINED = 1 / 3
-"""Share of the loops that one or two steps left out must explain, though the backbone's own search for breaks refused
-them. In 81 rings of 30 to 150 poses with one to six wrong loops a pose they explain .05 to .3, but for folded ones; in
-rooms of 30 views, every pair of which was tried, .3 to .6.
-"""
 SHARE_OF_PLACES = 0.25
 """Places that the backbone's loops join, as a share of those that the kept edges join, from which on it explains
 enough: .2 to 1.2 in 28 simulated graphs whose loops, more than half as many as steps, are a third to two thirds
@@ -47,14 +42,11 @@ def lattice_backbone(graph: ViewGraph, kept: Bools, doubted: Backbone | None = N
     explains more than these: it confirms loops of more places, or few places speak against it.
 
     It is a rival where the kept edges leave out steps that no near loop contradicts. A backbone that is `doubted` by
-    its own loops is also one where it explains enough, or where these leave out a step or two that its own search for
-    breaks refused.
+    its own loops is also one where it explains enough.
     """
     if doubted is not None and _explains_enough(doubted, kept):
         return doubted, True
     found = left_out_steps(graph, kept)
-    if doubted is not None and _is_refused(doubted, kept, found):
-        return doubted, True
     if not _is_rival(found):
         return None, False
     backbone = doubted or find_backbone(graph, in_lattice=True)
@@ -66,14 +58,6 @@ def lattice_backbone(graph: ViewGraph, kept: Bools, doubted: Backbone | None = N
         return backbone, True
     weight = PLACES_PER_WRONG_STEP if is_tested(backbone.chain) else 1.0
     return backbone, backbone.found.confirmed and weight * for_it > against
-
-
-def _is_refused(backbone: Backbone, kept: Bools, found: StepCounts) -> bool:
-    """Whether a backbone that confirms no loop has refused to break the one or two steps that the edges `kept (E,)`
-    leave out, and these explain few of the loops.
-    """
-    few = not backbone.found.confirmed and 0 < found.left_out < FEW_BREAKS
-    return few and bool(kept[~backbone.steps].mean() < EXPLAINED)
 
 
 def _explains_enough(backbone: Backbone, kept: Bools) -> bool:
