@@ -247,6 +247,17 @@ def test_a_tree_is_tested_by_nothing_and_refuted_by_nothing():
     assert solve_robust(wrong, start=truth, diagnosis=DiagnosisOptions(trust="none")).confirmed is False
 
 
+@pytest.mark.parametrize(("off_m", "confirmed"), [(0.0, True), (0.15, None), (1.0, False)])
+def test_a_ring_is_not_confirmed_that_is_open_by_more_than_it_states(off_m, confirmed):
+    """Nothing tells which of its three edges is wrong, and none is left out."""
+    steps = np.tile(se3.exp(np.array([0, 0, 2 * np.pi / 3, 1.0, 0, 0])), (3, 1, 1))
+    steps[2, 0, 3] += off_m
+    pairs = np.array([[0, 1], [1, 2], [2, 0]])
+    graph = ViewGraph.from_edges(np.arange(3), pairs, steps, np.tile(np.eye(6) / 0.05**2, (3, 1, 1)))
+    solution = solve_robust(graph)
+    assert solution.kept.all() and solution.confirmed is confirmed
+
+
 def test_rounding_along_a_path_leaves_no_edge_out():
     """Unstated information takes its size from what the poses leave over, of a path without loops rounding alone."""
     steps = se3.exp(0.3 * np.random.default_rng(0).normal(size=(100, 6)))
