@@ -11,7 +11,7 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.types import ViewGraph
-from tests.backbone_graphs import WORLDS, broken, drive, spanned
+from tests.backbone_graphs import WORLDS, blocks, broken, drive, spanned
 
 BROKEN_TOWNS: dict[str, tuple[int, dict[str, Any]]] = {
     "in places that tell little": (82, {"seed": 323, "count": 200, "dimension": 3, "wrong": 0.6, "in_groups": True}),
@@ -114,3 +114,11 @@ def test_no_right_step_is_called_wrong(wrong: float) -> None:
         made = drive(seed=seed, world=WORLDS[seed], wrong=wrong, in_groups=bool(seed % 2), count=200, loops=60)
         backbone = find_backbone(made.graph)
         assert backbone is None or backbone.used[:199].all()
+
+
+def test_a_few_of_many_loops_that_agree_by_chance_break_no_step() -> None:
+    """Along streets at right angles, where all wrong loops say the very same place: 3.9 m for .07."""
+    made = blocks(4)
+    backbone = find_backbone(made.graph)
+    assert backbone is not None
+    assert backbone.used[backbone.steps].all()

@@ -146,9 +146,9 @@ def _candidates(chain: Chain, found: Inferred, outliers: OutlierModel) -> list[t
     agreed = [each for each in agreed_breaks(pairwise, usual) if each.log_evidence > BY_CHANCE + fold]
     doubtful = [_is_contradicted(pairwise, each) for each in agreed]
     if any(doubtful):
-        others = np.ones(len(factor), bool)
-        others[np.concatenate([each.agreeing for each in compress(agreed, doubtful)])] = False
-        chance = list(_breaks_by_chance(pairwise, np.flatnonzero(others), usual, shares, outliers))
+        agreeing = np.zeros(len(factor), bool)
+        agreeing[np.concatenate([each.agreeing for each in compress(agreed, doubtful)])] = True
+        chance = list(_breaks_by_chance(pairwise, agreeing, usual, shares, outliers))
         agreed = [each for each, doubt in zip(agreed, doubtful, strict=True) if not doubt or _is_likelier(each, chance)]
     far, agreed = [each for each in agreed if not each.usual], [each for each in agreed if each.usual]
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
@@ -180,25 +180,29 @@ def _is_likelier(broken: Break, chance: list[Break]) -> bool:
 
 
 def _breaks_by_chance(
-    pairwise: PairwiseConsistency, others: Ints, usual: StepModel, shares: Floats, outliers: OutlierModel
+    pairwise: PairwiseConsistency, agreeing: Bools, usual: StepModel, shares: Floats, outliers: OutlierModel
 ) -> Iterator[Break]:
-    """The breaks by the loops `others (K,)` alone, of which those that the chain does not explain end at each other's
-    upper ends: they tell how much wrong loops agree by chance. In streets at right angles, or by motions that all say
-    the same place, they often do.
+    """The breaks where loops that the chain does not explain end at each other's upper ends, `agreeing (M,)` ones at
+    those of others: they tell how much wrong loops agree by chance. In streets at right angles, or by motions that all
+    say the same place, they often do.
     """
-    rng, chain, used = np.random.default_rng(5), pairwise.chain, pairwise.used[others]
-    log_wrong, by_chain, rows = pairwise.log_wrong[others], pairwise.by_chain[others], np.flatnonzero(~used)
-    for _ in range(DRAWN if len(rows) else 0):
-        ends = chain.ends[others]
-        ends[rows, 1] = ends[rng.permutation(rows), 1]
-        ends = np.where(np.ptp(ends, axis=1)[:, None] > 0, np.sort(ends, axis=1), chain.ends[others])
-        linear = linearise(chain.with_loops(others, ends), pairwise.linear.poses)
+    rng, chain, used = np.random.default_rng(5), pairwise.chain, pairwise.used
+    rows, every = np.flatnonzero(~used), np.arange(len(used))
+    for _ in range(DRAWN if (~used & ~agreeing).any() else 0):
+        others = rng.permutation(np.flatnonzero(~used & ~agreeing))
+        upper, apart = chain.ends[:, 1].copy(), np.flatnonzero(agreeing)
+        upper[others] = chain.ends[rng.permutation(others), 1]
+        swapped = np.resize(others, len(apart))
+        upper[apart], upper[swapped] = upper[swapped], chain.ends[apart, 1]
+        ends = np.sort(np.stack([chain.ends[:, 0], upper], axis=1), axis=1)
+        ends = np.where(np.ptp(ends, axis=1)[:, None] > 0, ends, chain.ends)
+        linear = linearise(chain.with_loops(every, ends), pairwise.linear.poses)
         covariance, residual = by_path(linear, rows), linear.loops[0][rows]
+        log_wrong, by_chain = pairwise.log_wrong.copy(), pairwise.by_chain.copy()
         log_wrong[rows] = outliers.at(linear.chain, rows, residual).log_density(covariance)
         factor = student_log_density(residual, covariance)[0] - log_wrong[rows]
         by_chain[rows] = np.logaddexp(shares[0] + factor, shares[1])
-        dealt = PairwiseConsistency(linear, by_chain, log_wrong, used)
-        yield from agreed_breaks(dealt, usual)
+        yield from agreed_breaks(PairwiseConsistency(linear, by_chain, log_wrong, used), usual)
 
 
 def bridged(chain: Chain, broken: Break) -> Chain:
