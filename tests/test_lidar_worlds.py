@@ -12,7 +12,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.demo.sweeps import REVOLUTION_S, Sweep
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.registration.clouds import CloudOptions
-from hodge_pipeline.registration.scan_to_map import _noise_of_normals, _variances
+from hodge_pipeline.registration.sweep_map import _noise_of_normals, _variances
 from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.start.sweeps import Sweeps, follow
 from hodge_pipeline.types import Floats, Frame, Source

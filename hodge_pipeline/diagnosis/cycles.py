@@ -1,4 +1,4 @@
-"""Which of the listed cycles close, and which are evidence for or against each edge."""
+"""Which of the listed cycles close, which are evidence for or against each edge, and when they are none."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import MEDIAN_CHI2
 from hodge_pipeline.complex.closing import cycle_errors
 from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.diagnosis.noise import Noise
-from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.solvers.backbone.sequence import sequential_edges
+from hodge_pipeline.solvers.backbone.step_tests import OF_STEPS
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 CLOSES_BELOW = 30.0
 """χ² over six dimensions of a cycle that closes, and of two edges that agree. Generous, since tails are heavy."""
@@ -54,6 +58,19 @@ def close_by_chance(cycles: Cycles, i_from_j: Floats, noise: Noise, reach_m: flo
     others = judge_cycles(cycles.loops, *cycle_errors(cycles.loops, dealt), noise, reach_m)
     well, chance = (int((each.chi2 < MEDIAN_CHI2[6]).sum()) for each in (cycles, others))
     return bool(well <= chance + SIGMAS * np.sqrt(chance * (1 - chance / max(len(cycles.chi2), 1))))
+
+
+def is_folded(graph: ViewGraph, kept: Bools, world_from_cam: Floats) -> bool:
+    """Whether consecutive edges among those `kept (E,)` are off by a large part of both their displacement and their
+    angle, on half of the path: loops that join any two places have then folded the sequence upon itself.
+
+    Of the path, not of the steps: where the sequence stands still, errors are all of a step.
+    """
+    steps = graph.select(np.flatnonzero(sequential_edges(graph) & kept))
+    off = np.stack(edge_residuals(steps, world_from_cam))
+    moved = np.stack([np.linalg.norm(steps.i_from_j[:, :3, 3], axis=1), se3.rotation_angle(steps.i_from_j)])
+    on_path = (moved * (off >= moved / OF_STEPS)).sum(axis=1)
+    return bool(moved.any() and (on_path >= moved.sum(axis=1) / 2).all())
 
 
 def usual_share(cycles: Cycles) -> float:

@@ -14,7 +14,7 @@ from hodge_pipeline.complex.closing import cycle_errors
 from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.complex.short_cycles import with_cycles_of
 from hodge_pipeline.diagnosis.consensus import agreeing, find_consensus, sought_from
-from hodge_pipeline.diagnosis.cycles import Cycles, close_by_chance, judge_cycles, witnesses
+from hodge_pipeline.diagnosis.cycles import Cycles, close_by_chance, is_folded, judge_cycles, witnesses
 from hodge_pipeline.diagnosis.evidence import Evidence, every_pair_tried, gather
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.on_backbone import judged_on_backbone
@@ -33,7 +33,7 @@ from hodge_pipeline.one_blas_thread import one_blas_thread
 from hodge_pipeline.solvers.backbone.chain import make_chain
 from hodge_pipeline.solvers.backbone.lattice import lattice_backbone, steps_are_wrong
 from hodge_pipeline.solvers.backbone.sequence import sequential_edges, vertex_ranks
-from hodge_pipeline.solvers.backbone.step_tests import is_folded, is_tested
+from hodge_pipeline.solvers.backbone.step_tests import is_tested
 from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
 from hodge_pipeline.solvers.resistance import Network
 from hodge_pipeline.solvers.weights import OUT_OF_PLANE, dimension_of
@@ -122,9 +122,10 @@ class _ByCycles:
     @cached_property
     def explains_nothing(self) -> bool:
         """Whether cycles close no better than by chance or the sequence is folded: `close_by_chance`, `is_folded`."""
-        known, found = self.evidence, self.found
-        by_chance = close_by_chance(self.cycles, known.graph.i_from_j, known.noise, known.reach_m)
-        return by_chance or is_folded(self.stated, found.kept, found.world_from_cam)
+        known = self.evidence
+        if close_by_chance(self.cycles, known.graph.i_from_j, known.noise, known.reach_m):
+            return True
+        return is_folded(self.stated, self.found.kept, self.found.world_from_cam)
 
     @cached_property
     def fit(self) -> Solved:

@@ -16,10 +16,10 @@ from hodge_pipeline.complex.checks import check_graph
 from hodge_pipeline.complex.chi2 import has_unit_information
 from hodge_pipeline.complex.closing import closes_better_than_chance
 from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.diagnosis.cycles import is_folded
 from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, backbone_or_diagnosis
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG, Diagnosis
-from hodge_pipeline.solvers.backbone.step_tests import is_folded
 from hodge_pipeline.solvers.backbone.trust import Backbone
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.reweighted import reweighted

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from hodge_pipeline.registration.scan_to_map import FEWEST_USUAL, START_LEVELS, START_SAMPLE_M, UNKNOWN, ScanToMap, Step
+from hodge_pipeline.registration.scan_to_map import UNKNOWN, ScanToMap, Step
+from hodge_pipeline.registration.sweep_map import FEWEST_USUAL, START_LEVELS, START_SAMPLE_M
 from hodge_pipeline.registration.sweeps import BACKWARDS, FORWARDS, UNUSED, retimed
 from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types import Floats, PointCloud

@@ -12,10 +12,10 @@ import numpy as np
 from hodge_pipeline.complex.chi2 import MEDIAN_CHI2
 from hodge_pipeline.solvers.backbone.breaks import Break, Runs, agreed_breaks, unusual_breaks
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
-from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mixture, student_log_density
+from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, optimised
 from hodge_pipeline.solvers.backbone.inference import Inferred, by_chance, infer, refused
-from hodge_pipeline.solvers.backbone.judge import by_path
+from hodge_pipeline.solvers.backbone.judge import densities
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
@@ -144,7 +144,7 @@ def _candidates(chain: Chain, found: Inferred, outliers: OutlierModel) -> list[t
     usual, least = StepModel.of(chain), by_chance(len(factor))
     fold = np.log(max((1 / loops_at_place(pairwise.chain.places)).sum(), 1))  # for the best of as many places
     agreed = [each for each in agreed_breaks(pairwise, usual) if each.log_evidence > BY_CHANCE + fold]
-    doubtful = [_is_contradicted(pairwise, each) for each in agreed]
+    doubtful = [_few_agree(pairwise, each) for each in agreed]
     if any(doubtful):
         agreeing = np.zeros(len(factor), bool)
         agreeing[np.concatenate([each.agreeing for each in compress(agreed, doubtful)])] = True
@@ -163,7 +163,7 @@ def _candidates(chain: Chain, found: Inferred, outliers: OutlierModel) -> list[t
     return candidates + [(each, least) for each in far[:1]]
 
 
-def _is_contradicted(pairwise: PairwiseConsistency, broken: Break) -> bool:
+def _few_agree(pairwise: PairwiseConsistency, broken: Break) -> bool:
     """Whether fewer than `CONTRADICTED` of the places of loops over a step that the chain does not explain agree on its
     break.
     """
@@ -197,11 +197,9 @@ def _breaks_by_chance(
         ends = np.sort(np.stack([chain.ends[:, 0], upper], axis=1), axis=1)
         ends = np.where(np.ptp(ends, axis=1)[:, None] > 0, ends, chain.ends)
         linear = linearise(chain.with_loops(every, ends), pairwise.linear.poses)
-        covariance, residual = by_path(linear, rows), linear.loops[0][rows]
         log_wrong, by_chain = pairwise.log_wrong.copy(), pairwise.by_chain.copy()
-        log_wrong[rows] = outliers.at(linear.chain, rows, residual).log_density(covariance)
-        factor = student_log_density(residual, covariance)[0] - log_wrong[rows]
-        by_chain[rows] = np.logaddexp(shares[0] + factor, shares[1])
+        log_right, log_wrong[rows] = densities(linear, rows, outliers)
+        by_chain[rows] = np.logaddexp(shares[0] + log_right - log_wrong[rows], shares[1])
         yield from agreed_breaks(PairwiseConsistency(linear, by_chain, log_wrong, used), usual)
 
 
@@ -225,11 +223,10 @@ def joined(chain: Chain) -> Chain:
         outliers = OutlierModel.of(chain)
         scales, shares = learned = learned or next(learned_scales(chain, outliers))
         linear, rows = linearise(scales.applied(chain), poses), np.arange(len(chain.ends))
-        covariance = by_path(linear, rows)
-        log_wrong = outliers.at(linear.chain, rows, linear.loops[0]).log_density(covariance)
+        log_right, log_wrong = densities(linear, rows, outliers)
         pairwise, pairs = PairwiseConsistency.of(linear, log_wrong), chain.path[chain.ends]
         apart = pairs[:, 0] != pairs[:, 1]
-        refuted = np.flatnonzero(~apart & (student_log_density(linear.loops[0], covariance)[0] < log_wrong))
+        refuted = np.flatnonzero(~apart & (log_right < log_wrong))
         mistaken = [len(group) for group in agreeing_groups(pairwise, refuted)]
         two = [(low, high) for low, high in np.unique(pairs[apart], axis=0).tolist()]
         is_fresh = not evidence

@@ -61,6 +61,14 @@ def by_path(linear: Linear, rows: Ints) -> Floats:
     return linear.loops[1][rows] + _along_path(linear, rows, 0.0)
 
 
+def densities(linear: Linear, rows: Ints, outliers: OutlierModel) -> tuple[Floats, Floats]:
+    """The log-densities (K,) of the residuals of loops (rows) along the bare chain, if they are right and if wrong."""
+    covariance, residual = by_path(linear, rows), linear.loops[0][rows]
+    return student_log_density(residual, covariance)[0], outliers.at(linear.chain, rows, residual).log_density(
+        covariance
+    )
+
+
 def _along_path(linear: Linear, rows: Ints, otherwise: float) -> Floats:
     """The covariance (K, p, p) of the path between the ends of loops (rows), `otherwise` between two paths."""
     a, b = linear.chain.ends[rows].T

@@ -61,22 +61,6 @@ def left_out_steps(graph: ViewGraph, kept: Bools) -> StepCounts:
     return StepCounts(int(uncontradicted.sum()), int(out.sum()))
 
 
-def is_folded(graph: ViewGraph, kept: Bools, world_from_cam: Floats) -> bool:
-    """Whether consecutive edges among those `kept (E,)` are off by a large part of both their displacement and their
-    angle, on half of the path: loops that join any two places have then folded the sequence upon itself.
-
-    Of the path, not of the steps: where the sequence stands still, errors are all of a step.
-    """
-    rows = np.flatnonzero(sequential_edges(graph) & kept)
-    motion = graph.i_from_j[rows]
-    left = se3.inverse(motion) @ _between(world_from_cam, *graph.edges[rows].T)
-    off, moved = (
-        np.stack([np.linalg.norm(each[:, :3, 3], axis=1), se3.rotation_angle(each)]) for each in (left, motion)
-    )
-    on_path = (moved * (off >= moved / OF_STEPS)).sum(axis=1)
-    return bool(moved.any() and (on_path >= moved.sum(axis=1) / 2).all())
-
-
 def agreeing_loops(chain: Chain, among: Bools) -> int:
     """How many of these loops (M,) agree with a neighbour: their cycle with another one whose ends are at most a step
     away closes within the gate, or within χ² by the covariance of its edges.
