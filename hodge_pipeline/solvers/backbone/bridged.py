@@ -226,7 +226,7 @@ def joined(chain: Chain) -> Chain:
         log_right, log_wrong = densities(linear, rows, outliers)
         pairwise, pairs = PairwiseConsistency.of(linear, log_wrong), chain.path[chain.ends]
         apart = pairs[:, 0] != pairs[:, 1]
-        refuted = np.flatnonzero(~apart & (log_right < log_wrong))
+        refuted = np.flatnonzero(~apart & (log_right < log_wrong - MISTAKEN))
         mistaken = [len(group) for group in agreeing_groups(pairwise, refuted)]
         two = [(low, high) for low, high in np.unique(pairs[apart], axis=0).tolist()]
         is_fresh = not evidence
@@ -278,10 +278,10 @@ class JoinEvidence:
             score = float(pairwise.gains(seed, rows, factor).sum()) - BY_CHANCE - float(np.log(len(pairwise.log_wrong)))
             best = max(best, (score, seed))
         groups = agreeing_groups(pairwise, rows)
-        first = np.array([group[0] for group in groups])
-        rivals = np.flatnonzero(pairwise.factor(np.full(len(first), first[0]), first) <= 0)
-        size = int((pairwise.factor(np.full(len(groups[0]), first[0]), groups[0]) > 0).sum())  # where too many, all are
-        return cls(best, int(first[0]), size, tuple(len(groups[each]) for each in rivals))
+        first = int(groups[0][0])
+        factors = [pairwise.factor(np.full(len(group), first), group) for group in groups]
+        rivals = tuple(len(each) for each in factors if each.max() < -MISTAKEN)
+        return cls(best, first, int((factors[0] > 0).sum()), rivals)  # where too many, all loops are a group
 
     def best(self, mistaken: list[int], odds: float) -> tuple[float, int]:
         """By how many nats the likeliest loop exceeds what joins two paths, and this loop.

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.chi2 import has_unit_information
+from hodge_pipeline.complex.chi2 import has_unit_information, with_equal_ends
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.cycles import spanning_forest
 from hodge_pipeline.solvers.backbone import plane
@@ -178,7 +178,7 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
     axes = free_axes(graph)
-    covariance = se3.covariances(graph.information[:, axes[:, None], axes])
+    covariance = se3.covariances(with_equal_ends(graph)[:, axes[:, None], axes])
     rows = np.flatnonzero(~backbone & (graph.edges[:, 0] != graph.edges[:, 1]))
     low, high = np.sort(place[graph.edges[rows]], axis=1).T
     rows = rows[np.lexsort((high, low))]  # samples of the loops must not depend on the order of the file

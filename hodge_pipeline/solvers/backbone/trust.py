@@ -8,7 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import expit
 
-from hodge_pipeline.complex.chi2 import chi2_by_information, has_unit_information, tail_gate, tail_weight
+from hodge_pipeline.complex.chi2 import (
+    chi2_by_information,
+    has_unit_information,
+    tail_gate,
+    tail_weight,
+    with_equal_ends,
+)
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone.bridged import MOST_BREAKS, infer_bridged
 from hodge_pipeline.solvers.backbone.chain import Chain, make_chain
@@ -82,7 +88,7 @@ class Backbone:
         width[self.chain.loop_edge] = loop * self.loop_width[:, None]
         whole = np.ones((graph.edge_count, 6))
         whole[:, self.chain.axes] = width
-        information = graph.information / (whole[:, :, None] * whole[:, None, :])
+        information = with_equal_ends(graph) / (whole[:, :, None] * whole[:, None, :])
         return replace(graph, information=information).select(np.flatnonzero(self.used))
 
     def places(self, edges: Bools) -> int:
