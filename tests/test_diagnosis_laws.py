@@ -110,9 +110,12 @@ def test_the_chi2_of_an_edge_is_the_same_written_the_other_way_round() -> None:
     np.testing.assert_allclose(squares[0], squares[1], rtol=1e-8, atol=1e-15)
 
 
-def test_the_diagnosis_of_edges_written_the_other_way_round_is_the_same_to_rounding() -> None:
-    """A scene in which every pair was tried, whose search is long: one other choice would end elsewhere."""
-    graph, _, _ = every_pair_tried(2)
+@pytest.mark.parametrize("views", [30, 50])
+def test_the_diagnosis_of_edges_written_the_other_way_round_is_the_same_to_rounding(views: int) -> None:
+    """A scene in which every pair was tried, judged on its steps or, of more views, without: one other choice in its
+    long search would end elsewhere.
+    """
+    graph, _, _ = every_pair_tried(2, views)
     rng = np.random.default_rng(2)
     rows = np.flatnonzero(rng.random(graph.edge_count) < 0.5)
     edges, motion = graph.edges.copy(), graph.i_from_j.copy()

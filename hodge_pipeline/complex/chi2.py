@@ -96,13 +96,6 @@ def has_unit_information(graph: ViewGraph) -> bool:
     return bool(units and np.count_nonzero(graph.information) == np.count_nonzero(diagonal))
 
 
-def with_equal_ends(graph: ViewGraph) -> Floats:
-    """The information (E, 6, 6), of units that stand for unknown information the mean of both ends."""
-    if not has_unit_information(graph):
-        return graph.information
-    return np.asarray((graph.information + se3.pull_back(graph.i_from_j, graph.information)) / 2)
-
-
 def mean_variances(graph: ViewGraph, planar: bool) -> tuple[Floats, Floats]:
     """The mean variances (E,) of an axis of rotation and of translation that the information states, the latter of both
     ends: an edge written the other way round has the same. A direction that nothing measured has a very large one.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline.complex.closing import errors_of_products
-from hodge_pipeline.complex.cycles import Loops, fundamental_products, spanning_forest
+from hodge_pipeline.complex.cycles import Loops, directed, fundamental_products, spanning_forest
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.cycles import WITNESSES, Cycles
 from hodge_pipeline.diagnosis.options import WRONG_BELOW
@@ -73,27 +73,28 @@ def _cycles(graph: ViewGraph, backbone: Backbone, in_loop: Bools) -> tuple[Cycle
     order = np.flatnonzero(same)[np.argsort((high - low)[same], kind="stable")]
     order = order[np.cumsum((high - low)[order] + 1) <= MOST_ENTRIES]
     low, high, chords = low[order], high[order], chain.loop_edge[order]
-    onward = graph.edges[chords, 0] == chain.order[low]
-    loops = _around(graph, chain, chords, low, high, onward)
-    both = np.concatenate([chain.step_edge[np.append(in_loop, False)[chain.step_edge]], chords])
-    steps = spanning_forest(graph.edges[both[: -len(chords) or None]], graph.vertex_count)
-    forest = replace(steps, edges=graph.edges[both])
-    products = fundamental_products(forest, graph.i_from_j[both], np.arange(len(both) - len(chords), len(both)))
+    loops = _around(graph, chain, chords, low, high)
+    steps = chain.step_edge[np.append(in_loop, False)[chain.step_edge]]
+    onward = directed(graph.i_from_j, chords, loops.sign[loops.offsets[:-1]])
+    forest = spanning_forest(graph.edges[steps], graph.vertex_count)
+    forest = replace(forest, edges=np.concatenate([graph.edges[steps], chain.order[np.stack([low, high], axis=1)]]))
+    motions = np.concatenate([graph.i_from_j[steps], onward])
+    products = fundamental_products(forest, motions, np.arange(len(steps), len(motions)))
     errors = errors_of_products(products, loops, graph.i_from_j)
     row = np.full(graph.edge_count, -1, np.int64)
     row[chords] = np.arange(len(chords))
     return Cycles(loops, *errors, backbone.chi2[chords], backbone.used[chords]), row
 
 
-def _around(graph: ViewGraph, chain: Chain, chords: Ints, low: Ints, high: Ints, onward: Bools) -> Loops:
-    """The cycles of loops (K,), from `low` to `high`, or back where not `onward`, with the steps that they span."""
+def _around(graph: ViewGraph, chain: Chain, chords: Ints, low: Ints, high: Ints) -> Loops:
+    """The cycles of loops (K,) from `low` to `high`, and back along the steps that they span."""
     offsets = np.concatenate([[0], np.cumsum(high - low + 1)])
     row = np.repeat(np.arange(len(chords)), high - low + 1)
     nth = np.arange(len(row)) - offsets[row]
-    at = np.where(nth == 0, high[row], np.where(onward[row], high[row] - nth + 1, low[row] + nth))
-    step = chain.step_edge[at]
-    sign = np.where((graph.edges[step, 0] == chain.order[at - 1]) == onward[row], -1, 1)
-    return Loops(offsets, np.where(nth == 0, chords[row], step), np.where(nth == 0, 1, sign))
+    at = high[row] - np.maximum(nth - 1, 0)
+    edge = np.where(nth == 0, chords[row], chain.step_edge[at])
+    begin = chain.order[np.where(nth == 0, low[row], at)]
+    return Loops(offsets, edge, np.where(graph.edges[edge, 0] == begin, 1, -1))
 
 
 def _reasons(

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.chi2 import has_unit_information, with_equal_ends
+from hodge_pipeline.complex.chi2 import has_unit_information
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.cycles import spanning_forest
 from hodge_pipeline.solvers.backbone import plane
@@ -37,6 +37,7 @@ class Chain:
     - `bridged (n,)`: steps whose motion is a guess, of a broken step or between paths; no scale is learned for them.
     - `axes (p,)`: free axes of a twist, three in the plane; `stated`: the graph has information, not the identity that
       stands for unknown, and most steps constrain every axis.
+    - `unit`: covariances are that identity, whichever end of an edge they are of; see `of_both_ends`.
     """
 
     order: Ints
@@ -51,6 +52,7 @@ class Chain:
     bridged: Bools
     axes: Ints
     stated: bool
+    unit: bool
 
     @property
     def size(self) -> int:
@@ -154,6 +156,10 @@ class Chain:
         into = self.adjoint(poses)
         return np.asarray(into @ covariance @ np.swapaxes(into, -1, -2))
 
+    def of_both_ends(self, motions: Floats, covariance: Floats) -> Floats:
+        """The mean covariances (M, p, p), in the axes of j, of motions i_from_j (M, 4, 4) that err alike at both ends."""
+        return 0.5 * (covariance + self.carried(se3.inverse(motions), covariance))
+
     def compose(self, a: Floats, b: Floats) -> Floats:
         """Motions `a b` (..., 4, 4)."""
         return np.asarray(a @ b) if self.is_spatial else plane.compose(a, b)
@@ -174,11 +180,12 @@ class Chain:
 def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
     """The chain of the backbone's edges (E,), a linear forest; the other edges are its loops, without self-loops."""
     graph, as_stated = credible_steps(graph, backbone)
+    unit = has_unit_information(graph)
     order, step_edge, path = _walk(graph.edges, graph.vertex_count, np.flatnonzero(backbone))
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
     axes = free_axes(graph)
-    covariance = se3.covariances(with_equal_ends(graph)[:, axes[:, None], axes])
+    covariance = se3.covariances(graph.information[:, axes[:, None], axes])
     rows = np.flatnonzero(~backbone & (graph.edges[:, 0] != graph.edges[:, 1]))
     low, high = np.sort(place[graph.edges[rows]], axis=1).T
     rows = rows[np.lexsort((high, low))]  # samples of the loops must not depend on the order of the file
@@ -186,9 +193,9 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
     at = np.flatnonzero(step_edge >= 0)
     edge = step_edge[at]
     is_reversed = place[graph.edges[edge, 0]] == at
-    step[at], step_covariance[at] = _directed(graph.i_from_j[edge], covariance[edge], is_reversed, axes)
+    step[at], step_covariance[at] = _directed(graph.i_from_j[edge], covariance[edge], is_reversed, axes, unit)
     ends = place[graph.edges[rows]]
-    motion, loop_covariance = _directed(graph.i_from_j[rows], covariance[rows], ends[:, 0] > ends[:, 1], axes)
+    motion, loop_covariance = _directed(graph.i_from_j[rows], covariance[rows], ends[:, 0] > ends[:, 1], axes, unit)
     usual = np.median(np.einsum("eii->ei", np.concatenate([step_covariance[at], loop_covariance])), axis=0)
     step_covariance[at] += np.diag(SMALLEST_SIGMA**2 * usual)
     loop_covariance += np.diag(SMALLEST_SIGMA**2 * usual)
@@ -204,7 +211,8 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
         loop_covariance,
         np.zeros(len(order), bool),
         axes,
-        as_stated and not has_unit_information(graph),
+        as_stated and not unit,
+        unit,
     )
 
 
@@ -218,7 +226,7 @@ def linked(chain: Chain, low: int, high: int, motion: Floats, covariance: Floats
     step, step_covariance, bridged = chain.step[moved], chain.step_covariance[moved], chain.bridged[moved]
     step[after], step_covariance[after], bridged[after] = motion, covariance, True
     ends = place[chain.ends]
-    loop, loop_covariance = _directed(chain.motion, chain.covariance, ends[:, 0] > ends[:, 1], chain.axes)
+    loop, loop_covariance = _directed(chain.motion, chain.covariance, ends[:, 0] > ends[:, 1], chain.axes, chain.unit)
     return replace(
         chain,
         order=chain.order[moved],
@@ -233,11 +241,12 @@ def linked(chain: Chain, low: int, high: int, motion: Floats, covariance: Floats
     )
 
 
-def _directed(motion: Floats, covariance: Floats, reverse: Bools, axes: Ints) -> tuple[Floats, Floats]:
-    """Motions and covariances, inverted where `reverse`: `Z⁻¹` has the covariance `Ad(Z) Σ Ad(Z)ᵀ`."""
+def _directed(motion: Floats, covariance: Floats, reverse: Bools, axes: Ints, unit: bool) -> tuple[Floats, Floats]:
+    """Motions and covariances, inverted where `reverse`: `Z⁻¹` has the covariance `Ad(Z) Σ Ad(Z)ᵀ`, but for units."""
     motion, covariance = motion.copy(), covariance.copy()
-    turned = se3.adjoint(motion[reverse])[:, axes[:, None], axes]
-    covariance[reverse] = turned @ covariance[reverse] @ np.swapaxes(turned, 1, 2)
+    if not unit:
+        turned = se3.adjoint(motion[reverse])[:, axes[:, None], axes]
+        covariance[reverse] = turned @ covariance[reverse] @ np.swapaxes(turned, 1, 2)
     motion[reverse] = se3.inverse(motion[reverse])
     return motion, covariance
 

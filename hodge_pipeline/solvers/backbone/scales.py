@@ -61,15 +61,14 @@ class Scales:
     loop_shift: float = 1.0
 
     def applied(self, chain: Chain) -> Chain:
-        """The chain with scaled covariances, but for bridges."""
+        """The chain with scaled covariances, but for bridges; those of units are then of both ends."""
         step, loop = self.units(chain)
-        return replace(
-            chain,
-            step_covariance=np.where(
-                chain.bridged[:, None, None], chain.step_covariance, chain.step_covariance * np.outer(step, step)
-            ),
-            covariance=chain.covariance * np.outer(loop, loop),
-        )
+        of_steps, of_loops = chain.step_covariance * np.outer(step, step), chain.covariance * np.outer(loop, loop)
+        if chain.unit:
+            of_steps = chain.of_both_ends(chain.step, of_steps)
+            of_loops = chain.of_both_ends(chain.motion, of_loops)
+        of_steps = np.where(chain.bridged[:, None, None], chain.step_covariance, of_steps)
+        return replace(chain, step_covariance=of_steps, covariance=of_loops, unit=False)
 
     @property
     def at_most_stated(self) -> Scales:

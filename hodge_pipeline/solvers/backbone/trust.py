@@ -8,13 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import expit
 
-from hodge_pipeline.complex.chi2 import (
-    chi2_by_information,
-    has_unit_information,
-    tail_gate,
-    tail_weight,
-    with_equal_ends,
-)
+from hodge_pipeline import se3
+from hodge_pipeline.complex.chi2 import chi2_by_information, has_unit_information, tail_gate, tail_weight
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone.bridged import MOST_BREAKS, infer_bridged
 from hodge_pipeline.solvers.backbone.chain import Chain, make_chain
@@ -80,7 +75,8 @@ class Backbone:
         step, loop = self.found.scales.units(self.chain)
         width = np.ones((graph.edge_count, len(self.chain.axes)))
         width[self.steps] = step * LOCAL
-        if has_unit_information(graph):  # n measurements of a step, or one over g steps, weigh as much less each
+        unit = has_unit_information(graph)
+        if unit:  # n measurements of a step, or one over g steps, weigh as much less each
             spans = self.chain.spans(graph.edges[self.steps])
             times = np.median(self.chain.over(spans)[self.chain.step_edge >= 0])
             width[self.steps] *= np.sqrt(times * np.diff(spans, axis=1))
@@ -88,7 +84,9 @@ class Backbone:
         width[self.chain.loop_edge] = loop * self.loop_width[:, None]
         whole = np.ones((graph.edge_count, 6))
         whole[:, self.chain.axes] = width
-        information = with_equal_ends(graph) / (whole[:, :, None] * whole[:, None, :])
+        information = graph.information / (whole[:, :, None] * whole[:, None, :])
+        if unit:
+            information = 0.5 * (information + se3.pull_back(graph.i_from_j, information))
         return replace(graph, information=information).select(np.flatnonzero(self.used))
 
     def places(self, edges: Bools) -> int:
