@@ -26,10 +26,11 @@ leave over (reduced χ²), whichever is larger; where no cycle tests the edges, 
 frame share, as of shutter, sampling and the delay between depth and colour, close every cycle: true poses are off by 9
 to 84 times what edges leave over in rendered rooms, by 1 to 9 times in drives of a LiDAR.
 """
-FARTHER, CHANCE = 2.5, 0.01
-"""Times the variance of edges and noise by which given poses are farther off than these, and the chance that any pair
-of such poses is farther off still. Poses that are true, or 3 mm off, reach 0.5 times in rendered rooms and drives, and
-2.4 times in real recordings (red kitchen); bends and jumps that edges mend reach 3 times and more.
+FARTHER, CHANCE = 3.5, 0.01
+"""Times as far off as edges and noise err, root mean square over the pairs of a distance, from which edges decide; or
+times as far as any pair is by chance, as at a jump. True poses reach 0.3 to 1.1 times in rendered rooms and drives and
+2.0 in real recordings (red kitchen): so far edges may be off, and from 3.5 on the squared error of the given poses is
+twice that of edges. The farthest pair alone, 1.6 times as far as by chance, called edges nearer wrongly twice as often.
 """
 PLACES = 16
 """Pairs of each distance, evenly along the path."""
@@ -43,8 +44,8 @@ def without_noise(
     """The given poses (K, 4, 4) less their white noise, where it exceeds that of the edges, which led to the solution;
     `firsts (S,)`: the rows that are followed by another one of their sequence; `shared_errors`: of `GuardOptions`.
 
-    The very array given, where its noise is no larger. None where edges decide alone: some pair, whatever its distance,
-    is farther from where they put it than both err.
+    The very array given, where its noise is no larger. None where edges decide alone: pairs of some distance lie so far
+    from where edges put them that the given poses must err by more than edges, see `FARTHER`.
     """
     edges = _weakened(graph, solution, shared_errors)
     component = connected_components(edges.edges, edges.vertex_count)
@@ -54,8 +55,11 @@ def without_noise(
     except (GraphError, np.linalg.LinAlgError, RuntimeError):  # a singular graph has no covariance
         return None
     white = _white(solution, given, firsts[component[firsts] == component[firsts + 1]])
-    if _farther(solution, given, np.concatenate(octaves), np.concatenate(covariances), white):
-        return None
+    chance = float(chdtri(6, CHANCE / max(1, sum(map(len, octaves)))))
+    for pairs, spread in zip(octaves, covariances, strict=True):
+        chi2 = _chi2(solution, given, pairs, spread, white)
+        if len(chi2) and max(chi2.mean() / 6, chi2.max() / chance) > FARTHER**2:
+            return None
     if not (white > _white_at_most(covariances[0])).any():
         return given
     information = np.diag(np.repeat(1 / np.maximum(white, LEAST * white.max()), 3))
@@ -108,11 +112,10 @@ def _white_at_most(of_steps: Floats) -> Floats:
     return spread.mean(axis=(0, 2)) / 2 if len(spread) else np.full(2, np.inf)
 
 
-def _farther(solution: Solution, given: Floats, pairs: Ints, covariances: Floats, white: Floats) -> bool:
-    """Whether any pair (P, 2) is farther off than edges and white noise allow, see `FARTHER`."""
+def _chi2(solution: Solution, given: Floats, pairs: Ints, covariances: Floats, white: Floats) -> Floats:
+    """χ² (P,) of how far pairs (P, 2) of given poses lie from where edges put them, as edges and white noise err."""
     noise = np.diag(np.repeat(white, 3))
     second_from_first = se3.adjoint(se3.between(given, pairs[:, ::-1]))
     both = covariances + noise + second_from_first @ noise @ np.swapaxes(second_from_first, 1, 2)
     off = _corrections(solution, given, pairs)
-    chi2 = np.einsum("pi,pi->p", off, np.linalg.solve(both, off[..., None])[..., 0])
-    return bool((chi2 > FARTHER * chdtri(6, CHANCE / max(1, len(pairs)))).any())
+    return np.asarray(np.einsum("pi,pi->p", off, np.linalg.solve(both, off[..., None])[..., 0]))

@@ -35,7 +35,7 @@ CHI2_TOLERANCE = 0.02
 KNOTS_APART = (16, 8, 4, 2, 1)
 """Key frames between two knots of the correction: the steps between keep their given shape, which may be better than
 registered ones. The widest spacing that fits the held-out pairs as well as the best is kept."""
-KEPT = "already optimal: edges may err by as much as they correct these poses"
+KEPT = "nothing tells which are nearer: edges may err by as much as they correct these poses"
 LEAST_JOINED = 0.2
 """Share of the key frames that must overlap with another one, else the given poses are not of these frames."""
 
