@@ -157,7 +157,7 @@ class Chain:
         return np.asarray(into @ covariance @ np.swapaxes(into, -1, -2))
 
     def of_both_ends(self, motions: Floats, covariance: Floats) -> Floats:
-        """The mean covariances (M, p, p), in the axes of j, of motions i_from_j (M, 4, 4) that err alike at both ends."""
+        """Mean covariances (M, p, p), in j's axes, of motions i_from_j (M, 4, 4) that err alike at both ends."""
         return 0.5 * (covariance + self.carried(se3.inverse(motions), covariance))
 
     def compose(self, a: Floats, b: Floats) -> Floats:
