@@ -283,3 +283,30 @@ def blocks(seed: int, count: int = 300, loops: int = 40, wrong: int = 300) -> Dr
         dimension=2,
     )
     return Drive(graph, np.asarray(truth), np.arange(graph.edge_count) < len(right))
+
+
+def field(seed: int) -> Drive:
+    """A field that is mown in eight rows, two metres apart, with 70 loops between near rows and 30 that take a row for
+    the next one.
+    """
+    rng, position = np.random.default_rng(seed), np.arange(160)
+    row, along = np.divmod(position, 20)
+    places = np.stack([np.where(row % 2, 19 - along, along), 2.0 * row, 0.0 * row], axis=1)
+    truth = se3.from_parts(se3.so3_exp(np.outer(np.where(row % 2, np.pi, 0.0), [0.0, 0.0, 1.0])), places)
+    moved = np.eye(4)
+    moved[1, 3] = 2.0
+
+    def ends(shift: Floats, count: int) -> Ints:
+        near = cKDTree(places + shift).query_ball_point(places, 2.3)
+        pairs = np.array([(i, j) for i, others in enumerate(near) for j in others if abs(i - j) > 8])
+        return pairs[rng.choice(len(pairs), count, replace=False)]
+
+    steps = np.stack([position[:-1], position[1:]], axis=1)
+    good, bad = ends(np.zeros(3), 70), ends(moved[:3, 3], 30)
+    edges, right = np.concatenate([steps, good, bad]), len(steps) + len(good)
+    motion = se3.inverse(truth[edges[:, 0]]) @ truth[edges[:, 1]]
+    motion[right:] = se3.inverse(truth[bad[:, 0]]) @ moved @ truth[bad[:, 1]]
+    sigma = np.where(np.arange(len(edges))[:, None] < len(steps), [[0.01] * 3 + [0.03] * 3], [[0.01] * 3 + [0.05] * 3])
+    motion = motion @ se3.exp(rng.normal(size=sigma.shape) * sigma)
+    graph = ViewGraph.from_edges(position, edges, motion, np.eye(6) / sigma[:, None, :] ** 2, dimension=3)
+    return Drive(graph, np.asarray(truth), np.arange(len(edges)) < right)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -31,7 +32,8 @@ class Inferred:
     - `start`: the bare chain with those scales; `linear`: at the poses at which the loops were judged; `reduced`: the
       graph of the used loops, or of those that `thinned` leaves.
     - `log_evidence`: of the loops, against all being wrong; `confirmed`: whether it exceeds that of chance. If not,
-      none should be used: see `refused`.
+      none should be used: see `refused`. `of_places`: the log-odds that all places that were found right are, each of
+      them counting once.
     """
 
     used: Bools
@@ -42,6 +44,7 @@ class Inferred:
     reduced: Reduced
     log_evidence: float
     confirmed: bool
+    of_places: float
 
     @cached_property
     def polished(self) -> tuple[Linear, Floats]:
@@ -55,9 +58,9 @@ def infer(
     """The loops of a chain, judged; those of `trusted (M,)` are used in any case.
 
     `may_thin`: where the right loops leave more than `MOST_UNKNOWNS`, all are judged at the poses of some of them;
-    without it None comes back then. `scales`: of the errors; by default those learned from the loops by which these are
-    likelier, and learned anew at the poses that they lead to where the drift of a long path had hidden how loops err:
-    where scales there differ much, other loops agree by them, and the loops are likelier.
+    without it None comes back then. `scales`: of the errors; by default those learned from the loops by which their
+    places are likelier, and learned anew at the poses that they lead to where the drift of a long path had hidden how
+    loops err: where scales there differ much, other loops agree by them, and the places are likelier.
     """
     learned = learned_scales(chain, outliers) if scales is None else [(scales, EVEN)]
     found: Inferred | None = None
@@ -65,7 +68,7 @@ def infer(
         other = _Trial.of(chain, outliers, trusted, may_thin, *given).found()
         if other is None:
             return None
-        found = other if found is None or other.log_evidence > found.log_evidence else found
+        found = other if found is None or other.of_places > found.of_places else found
     for _ in range(MOST_ANEW if scales is None else 0):
         if found is None or not found.confirmed:
             break
@@ -73,7 +76,7 @@ def infer(
         if not found.scales.differ_much(here) or not _others_agree(found, here.applied(chain), outliers, trusted):
             break
         other = _Trial.of(chain, outliers, trusted, may_thin, here, EVEN).found()
-        if other is None or other.log_evidence <= found.log_evidence:
+        if other is None or other.of_places <= found.of_places:
             break
         found = other
     return found
@@ -136,14 +139,48 @@ class _Trial:
             return None
         except np.linalg.LinAlgError:  # loops tear paths so far apart that covariances are lost in rounding
             reduced = thinned(self.start.chain, np.flatnonzero(self.trusted))
-            return Inferred(
-                self.trusted, self.alone, self.scales, self.start, self.start, reduced, 0.0, confirmed=False
-            )
+            return Inferred(self.trusted, self.alone, self.scales, self.start, self.start, reduced, 0.0, False, -np.inf)
 
     def inferred(self) -> Inferred:
-        """The loops judged at the poses of the right ones."""
-        used, rated = self.grown()
-        shares, linear = rated.shares, rated.linear
+        """The loops judged at the poses of the right ones. Where some that stand out on the bare chain are not used in
+        the end, these are grown by halves too, and the places decide that are likelier together: evidence of single
+        loops counts a mistake as often as it is repeated.
+        """
+        out = self.standing_out
+        at_once = self.grown(out, self.start, self.shares)
+        found = self.settled(*at_once)
+        if not (out & ~found.used).any():
+            return found
+        by_halves = self.halves_grown(np.flatnonzero(out))
+        if (by_halves[0] == at_once[0] & out).all():
+            return found
+        return max(found, self.settled(*self.grown(*by_halves)), key=lambda each: each.of_places)
+
+    @property
+    def standing_out(self) -> Bools:
+        """Loops (M,) that the bare chain alone makes likely, and the trusted ones."""
+        return np.asarray(self.alone.factor > np.log(max(len(self.trusted), 1))) | self.trusted
+
+    def halves_grown(self, rows: Ints) -> tuple[Bools, Linear, Floats]:
+        """Which of the loops `rows (K,)` are used (M,) where in each round the stronger half of those that stand out is
+        added; the poses and shares that these lead to.
+        """
+        chain, alone = self.start.chain, self.alone
+        some = replace(
+            self,
+            start=replace(self.start, chain=chain.with_loops(rows, chain.ends[rows])),
+            alone=Judged(alone.log_odds[rows], alone.factor[rows], alone.chi2[rows], alone.log_wrong[rows]),
+            trusted=self.trusted[rows],
+        )
+        begin = _stronger_half(some.alone.factor, some.standing_out) | some.trusted
+        some_used, rated = some.grown(begin, some.start, self.shares, _stronger_half)
+        used = np.zeros_like(self.trusted)
+        used[rows] = some_used
+        return used, replace(rated.linear, chain=chain), rated.shares
+
+    def settled(self, used: Bools, rated: _Rated) -> Inferred:
+        """The loops that agree from these on (M,), of places that are right together."""
+        shares, linear, of_places = rated.shares, rated.linear, -np.inf
         start, chain, trusted = self.start, self.start.chain, self.trusted
         fold = int(chain.broken.sum()) * float(np.log(chain.size))  # for the choice of the broken steps among all
         for _ in range(MOST_ANEW):
@@ -153,14 +190,15 @@ class _Trial:
                 break
             places = Places.of(start, self.alone, agreed, self.outliers)
             best = places.best(linear)
-            confirmed = best.of_all > MISTAKEN + fold and places.chance(best.right) + fold < -BY_CHANCE
+            of_places = best.of_all - fold
+            confirmed = of_places > MISTAKEN and places.chance(best.right) + fold < -BY_CHANCE
             used = np.append(best.right, False)[places.members]
             if (used == before).all() or not confirmed:
                 break
             linear = best.fit.linear
-        return self.final(used | trusted, shares, linear, confirmed)
+        return self.final(used | trusted, shares, linear, confirmed, of_places)
 
-    def final(self, used: Bools, shares: Floats, linear: Linear, confirmed: bool) -> Inferred:
+    def final(self, used: Bools, shares: Floats, linear: Linear, confirmed: bool, of_places: float) -> Inferred:
         """All loops judged at the poses of the used ones (M,), of which those that remain likely are used."""
         start, chain, trusted = self.start, self.start.chain, self.trusted
         reduced = thinned(chain, np.flatnonzero(used))
@@ -171,20 +209,27 @@ class _Trial:
         if np.log(shares[0] / shares[1]) < MISTAKEN:
             used &= ~_single_joins(chain, used) | trusted
         linear, reduced = fit.linear if used.any() else start, thinned(chain, np.flatnonzero(used))
-        return Inferred(used, judged, self.scales, start, linear, reduced, top, confirmed)
+        return Inferred(used, judged, self.scales, start, linear, reduced, top, confirmed, of_places)
 
-    def grown(self) -> tuple[Bools, _Rated]:
-        """Loops (M,) to begin with, and all loops at their poses: the strongest alone, then in rounds those that stand
-        out at the new poses.
+    def grown(
+        self,
+        used: Bools,
+        linear: Linear,
+        shares: Floats,
+        chosen: Callable[[Floats, Bools], Bools] = lambda score, among: among,
+    ) -> tuple[Bools, _Rated]:
+        """Loops (M,), and all loops at their poses, from those `used (M,)` on: in rounds those are added that stand out
+        at the new poses, or are `chosen` among these by their score (M,).
 
-        Weak loops may be wrong in one way together and, taken all at once, bend the poses until right ones do not fit.
+        Weak loops may be wrong in one way together and, taken all at once, bend the poses until right ones do not fit:
+        wrong ones over many steps stand out until strong ones have told where these lead. By halves, a mistaken place
+        among the strongest may be followed, which the others would outvote.
         """
-        trusted = self.trusted
-        limit = 0.5 * np.log(max(len(trusted), 1))
-        used = (self.alone.factor > 2 * limit) | trusted
-        rated = self.rated(used, self.start, self.shares)
+        limit = 0.5 * np.log(max(len(self.trusted), 1))
+        rated = self.rated(used, linear, shares)
         for number in range(MOST_GROWN):
-            before, used = used, (rated.score > limit) | (used & (rated.score > 0)) | trusted
+            before, kept = used, (used & (rated.score > 0)) | self.trusted
+            used = kept | chosen(rated.score, (rated.score > limit) & ~kept)
             if number and used.sum() <= before.sum():
                 break
             rated = self.rated(used, rated.linear, rated.shares)
@@ -232,6 +277,11 @@ class _Trial:
             seen = np.packbits(used).tobytes()
         judged, linear = best
         return _agreeing(judged), judged, linear
+
+
+def _stronger_half(score: Floats, among: Bools) -> Bools:
+    """Of the loops `among (M,)` those whose score (M,) is at least their median."""
+    return among & (score >= np.median(score[among])) if among.any() else among
 
 
 def _single_joins(chain: Chain, used: Bools) -> Bools:
