@@ -118,6 +118,16 @@ def test_las_points_outside_the_box_of_their_header_count_from_their_own_middle(
     np.testing.assert_allclose(cloud.points_in_cam, FAR + ROOM - [431_001, 5_401_002, 121], atol=2e-4)
 
 
+@pytest.mark.parametrize(("at", "value"), [(131, 0.0), (139, np.inf), (155, np.nan), (171, 1e300)])
+def test_las_coordinates_without_a_scale_are_refused(tmp_path: Path, at: int, value: float) -> None:
+    path = write_las(tmp_path / "a.las", ROOM)
+    contents = bytearray(path.read_bytes())
+    contents[at : at + 8] = np.float64(value).tobytes()
+    path.write_bytes(contents)
+    with pytest.raises(SourceError, match=r"a\.las: laspy cannot read it \(scales .* and offsets .*\): convert it"):
+        CloudFolderReader().open(path)
+
+
 @pytest.mark.parametrize("left", [0, 49])
 def test_a_las_file_cut_between_two_points_is_refused(tmp_path: Path, left: int) -> None:
     path = write_las(tmp_path / "a.las", ROOM)
@@ -131,10 +141,8 @@ def test_what_the_rust_of_laspy_panics_at_is_one_line(tmp_path: Path) -> None:
     pytest.importorskip("lazrs", reason="lazrs is not installed: pip install 'hodge-pipeline[scans]'")
     path = write_las(tmp_path / "a.laz", ROOM)
     contents = bytearray(path.read_bytes())
-    chunk_size = contents.index(b"laszip encoded") - 2 + 54 + 12
-    contents[chunk_size : chunk_size + 4] = b"\xff" * 4  # chunks of any size, by their table
-    points = int.from_bytes(contents[96:100], "little")
-    contents[points : points + 8] = b"\xff" * 8  # of which there is none
+    compressor = contents.index(b"laszip encoded") - 2 + 54
+    contents[compressor], contents[compressor + 12 : compressor + 16] = 1, bytes(4)  # without chunks, as LASzip began
     path.write_bytes(contents)
     with pytest.raises(SourceError, match=r"a\.laz: laspy cannot read it \(.*\): convert it to PLY"):
         CloudFolderReader().open(path).frames[0].read_points()

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hodge_adapters.clouds.columns import COLOURS, ROWS_IN_PART, ZERO, Columns, Corner, parts_of
+from hodge_adapters.clouds.columns import COLOURS, MAX_METRES, ROWS_IN_PART, ZERO, Columns, Corner, parts_of
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
@@ -124,7 +124,12 @@ def las_parts(path: Path) -> Iterator[Columns]:
 def _opened_las(path: Path) -> Any:
     package = library("laspy", path)
     _check_counts(path)
-    return package.open(open_input(path), closefd=True)
+    file = package.open(open_input(path), closefd=True)
+    scales, offsets = np.asarray(file.header.scales, float), np.asarray(file.header.offsets, float)
+    if not (np.isfinite(scales) & (scales != 0) & (np.abs(offsets) < MAX_METRES)).all():
+        file.close()
+        raise ValueError(f"scales {scales.tolist()} and offsets {offsets.tolist()} of its coordinates")
+    return file
 
 
 def _check_points(path: Path, count: int) -> None:
