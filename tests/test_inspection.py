@@ -130,6 +130,15 @@ def test_frames_that_cannot_be_read_are_told(error: type[Exception]) -> None:
     assert facts["unreadable among them"] == ["frame.png: is no PNG"] and facts["frames looked into"] == 2
 
 
+def test_where_no_frame_can_be_read_the_reason_is_the_error(tmp_path: Path) -> None:
+    (tmp_path / "0.ply").write_text("ply\n")
+    with pytest.raises(SourceError, match=r"^\S+0\.ply: no PLY header"):
+        inspect(tmp_path)
+    (tmp_path / "1.ply").write_text("ply\n")
+    with pytest.raises(SourceError, match=r"none of the 2 frames looked into can be read: \S+0\.ply: no PLY header"):
+        inspect(tmp_path)
+
+
 @pytest.mark.parametrize("error", [SourceError, OSError])
 def test_images_without_readable_colours_are_told(error: type[Exception]) -> None:
     frames = [replace(frame, read_colour=partial(unreadable, error)) for frame in walk(2)]

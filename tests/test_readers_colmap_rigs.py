@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from hodge_adapters.colmap.content import read_model
 from hodge_adapters.colmap.reader import ColmapReader
 from hodge_adapters.colmap.writer import ColmapWriter
 from hodge_pipeline import se3
@@ -52,6 +53,17 @@ def test_without_rigs_the_images_own_poses_hold(tmp_path: Path) -> None:
     np.testing.assert_allclose(centres(source), [[-5, -5, -5]] * 4)
 
 
+@pytest.mark.parametrize(("length", "is_noted"), [(1 + 1e-5, False), (2.0, True)])
+def test_quaternions_of_another_length_are_divided_by_it(tmp_path: Path, length: float, is_noted: bool) -> None:
+    own = f"{0.6 * length:.9g} 0 0 {0.8 * length:.9g} 0 0 5"
+    model, content = read_model(write_model(tmp_path / "model", None, None, own))
+    turn = [[-0.28, 0.96, 0], [-0.96, -0.28, 0], [0, 0, 1]]  # world from camera: about z by -2 arccos(0.6)
+    np.testing.assert_allclose(content.images[0].world_from_cam[:3, :3], turn, atol=1e-7)
+    np.testing.assert_allclose(np.linalg.norm(model.images[1].cam_from_world().rotation.quat), 1, atol=1e-12)
+    note = "4 of 4 poses have a quaternion of another length than 1 (as 2)"
+    assert (note in content.notes) == is_noted
+
+
 @pytest.mark.parametrize(
     ("rigs", "frames", "complaint"),
     [
@@ -91,7 +103,7 @@ def test_rigs_that_pycolmap_wrote(tmp_path: Path, form: str) -> None:
         ("1 2 CAMERA 1 CAMERA 2 1 1 0 0\n", FRAMES, "rigs.txt:1: .*HAS_POSE"),
         ("1 2 CAMERA 1 CAMERA 2 yes\n", FRAMES, "rigs.txt:1: .*HAS_POSE"),
         ("1 1 SONAR 1\n", FRAMES, "rigs.txt:1: .*SENSOR_TYPE"),
-        ("1 2 CAMERA 1 CAMERA 2 1 0 0 0 0 0 0 0\n", FRAMES, "quaternion is zero"),
+        ("1 2 CAMERA 1 CAMERA 2 1 0 0 0 0 0 0 0\n", FRAMES, "quaternion is of length 0, not 1"),
         (RIGS + RIGS, FRAMES, "given twice"),
         ("1 2 CAMERA 1 CAMERA 1 0\n", FRAMES, "a sensor twice"),
         (RIGS, "1 1 1 0 0 0 0 0 0 2 CAMERA 1 1\n", "frames.txt:1: .*triples"),

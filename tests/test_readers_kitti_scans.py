@@ -130,3 +130,11 @@ def test_scans_of_kitti_07(data_dir: Path) -> None:
     assert [frame.frame_id for frame in source.frames] == [f"{row:06d}.bin" for row in range(5)]
     assert sizes == [21562, 24703, 24573, 16911, 19872]
     assert "the angles of 5 .bin scans are those of KITTI's HDL-64E" in source.notes[0]
+
+
+@pytest.mark.filterwarnings("error")
+def test_numbers_that_are_none_are_left_out_in_silence(tmp_path: Path) -> None:
+    rows = lidar_scan().astype("<f4")
+    rows[5, 0], rows[7:9] = np.nan, np.inf
+    (tmp_path / "000000.bin").write_bytes(rows.tobytes())
+    assert len(read_bin(tmp_path / "000000.bin")) == len(rows) - 3

@@ -30,10 +30,12 @@ def test_arrays_of_numpy_are_scans(tmp_path: Path) -> None:
     np.testing.assert_allclose(clouds[2].times_s, np.arange(40) * 0.002, atol=1e-7)
 
 
-@pytest.mark.parametrize("damage", ["pickle", "cut", "text", "shape"])
+@pytest.mark.parametrize("damage", ["pickle", "cut", "text", "shape", "header"])
 def test_what_no_scan_can_be_read_of_is_said(tmp_path: Path, damage: str) -> None:
     file = tmp_path / "sweep_0.npy"
     np.save(file, np.array([{}]) if damage == "pickle" else np.zeros((3, 40)) if damage == "shape" else POINTS)
     file.write_bytes({"cut": file.read_bytes()[:-8], "text": b"x y z\n1 2 3\n"}.get(damage, file.read_bytes()))
+    if damage == "header":
+        file.write_bytes(file.read_bytes().replace(b"}", b"(", 1))
     with pytest.raises(SourceError, match=r"sweep_0\.npy: .*(save it again|give rows)"):
         CloudFolderReader().open(file).frames[0].read_points()

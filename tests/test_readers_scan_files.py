@@ -104,3 +104,83 @@ def test_a_las_header_that_counts_too_much_is_refused_at_once(tmp_path: Path, at
     path.write_bytes(contents)
     with pytest.raises(SourceError, match=r"a.las: laspy cannot read it \(counts .* of \d+ on\): convert it to PLY"):
         CloudFolderReader().open(tmp_path)
+
+
+@pytest.mark.parametrize("said", [np.zeros((2, 3)), np.array([[4.31e9, 5.401e10, 1.2e6], [4.32e9, 5.402e10, 1.3e6]])])
+def test_las_points_outside_the_box_of_their_header_count_from_their_own_middle(
+    tmp_path: Path, said: np.ndarray
+) -> None:
+    path = write_las(tmp_path / "a.las", FAR + ROOM)
+    contents = bytearray(path.read_bytes())
+    contents[179:227] = said[::-1].T.astype("<f8").tobytes()  # highest and lowest x, then y, z
+    path.write_bytes(contents)
+    cloud = CloudFolderReader().open(path).frames[0].read_points()
+    np.testing.assert_allclose(cloud.points_in_cam, FAR + ROOM - [431_001, 5_401_002, 121], atol=2e-4)
+
+
+@pytest.mark.parametrize(("at", "value"), [(131, 0.0), (139, np.inf), (155, np.nan), (171, 1e300)])
+def test_las_coordinates_without_a_scale_are_refused(tmp_path: Path, at: int, value: float) -> None:
+    path = write_las(tmp_path / "a.las", ROOM)
+    contents = bytearray(path.read_bytes())
+    contents[at : at + 8] = np.float64(value).tobytes()
+    path.write_bytes(contents)
+    with pytest.raises(SourceError, match=r"a\.las: laspy cannot read it \(scales .* and offsets .*\): convert it"):
+        CloudFolderReader().open(path)
+
+
+@pytest.mark.parametrize("left", [0, 49])
+def test_a_las_file_cut_between_two_points_is_refused(tmp_path: Path, left: int) -> None:
+    path = write_las(tmp_path / "a.las", ROOM)
+    contents, row_bytes = path.read_bytes(), 34
+    path.write_bytes(contents[: len(contents) - row_bytes * (50 - left)])
+    with pytest.raises(SourceError, match=rf"a\.las: says 50 points, has {left}: copy it again"):
+        CloudFolderReader().open(path).frames[0].read_points()
+
+
+def test_what_the_rust_of_laspy_panics_at_is_one_line(tmp_path: Path) -> None:
+    pytest.importorskip("lazrs", reason="lazrs is not installed: pip install 'hodge-pipeline[scans]'")
+    path = write_las(tmp_path / "a.laz", ROOM)
+    contents = bytearray(path.read_bytes())
+    compressor = contents.index(b"laszip encoded") - 2 + 54
+    contents[compressor], contents[compressor + 12 : compressor + 16] = 1, bytes(4)  # without chunks, as LASzip began
+    path.write_bytes(contents)
+    with pytest.raises(SourceError, match=r"a\.laz: laspy cannot read it \(.*\): convert it to PLY"):
+        CloudFolderReader().open(path).frames[0].read_points()
+
+
+def e57_of_fields(path: Path, fields: dict[str, tuple[float, float]]) -> Path:
+    """A scan of one point: its fields, each a value and the largest that may be stored; `int` is stored as one."""
+    pye57 = pytest.importorskip("pye57", reason="pye57 is not installed: pip install 'hodge-pipeline[scans]'")
+    libe57, file = pye57.libe57, pye57.E57(str(path), mode="w")
+    image, buffers = file.image_file, libe57.VectorSourceDestBuffer()
+    prototype = libe57.StructureNode(image)
+    columns = {name: np.array([value], float) for name, (value, _) in fields.items()}  # buffers do not keep them alive
+    for name, (value, largest) in fields.items():
+        is_whole = isinstance(value, int)
+        prototype.set(name, libe57.IntegerNode(image, 0, 0, largest) if is_whole else libe57.FloatNode(image, 0.0))
+        buffers.append(libe57.SourceDestBuffer(image, name, columns[name], 1, True, True))
+    scan = libe57.StructureNode(image)
+    scan.set("guid", libe57.StringNode(image, "{0}"))
+    points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
+    scan.set("points", points)
+    file.data3d.append(scan)
+    writer = points.writer(buffers)
+    writer.write(1)
+    writer.close()
+    file.close()
+    return path
+
+
+def test_an_e57_with_stamps_and_colours_of_16_bits_is_read(tmp_path: Path) -> None:
+    place = {f"cartesian{axis}": (float(at), 0.0) for at, axis in enumerate("XYZ")}
+    colour = {f"color{name}": (200 * 257, 65535) for name in ("Red", "Green", "Blue")}
+    path = e57_of_fields(tmp_path / "hall.e57", {**place, **colour, "timeStamp": (7.0, 0.0)})
+    cloud = CloudFolderReader().open(path).frames[0].read_points()
+    assert cloud.points_in_cam.tolist() == [[0, 1, 2]]
+    assert cloud.colours.tolist() == [[200, 200, 200]]
+
+
+def test_an_e57_of_angles_says_what_it_has(tmp_path: Path) -> None:
+    path = e57_of_fields(tmp_path / "hall.e57", {"sphericalRange": (1.0, 0.0)})
+    with pytest.raises(SourceError, match=r"scan 0 has sphericalRange, not cartesianX, .*\): convert it to PLY"):
+        CloudFolderReader().open(path).frames[0].read_points()

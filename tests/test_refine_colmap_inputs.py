@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 import hodge_pipeline
 from colmap_data import FREE, disturbed, noisy, synthetic
+from hodge_adapters.colmap.content import read_model
 from hodge_adapters.colmap.models import ColmapModels
 from hodge_adapters.colmap.reader import ColmapReader
 from hodge_adapters.colmap.writer import ColmapWriter
@@ -113,6 +114,22 @@ def test_points_that_are_not_finite_are_left_out_and_noted(sparse: Path) -> None
         (result,) = hodge_pipeline.refine_colmap(given, overrides=FREE).results
         assert result.start.quality.points == count - 2 and note in result.notes
     assert spoiled.num_points3D() == count
+
+
+def test_only_features_of_points_must_be_finite(sparse: Path, tmp_path: Path) -> None:
+    model = pycolmap.Reconstruction(sparse / "1")
+    image = model.images[min(model.images)]
+    next(point for point in image.points2D if not point.has_point3D()).xy = np.array([np.nan, np.nan])
+    model.write_text(tmp_path)  # COLMAP undistorts to NaN what lies beyond its lens model
+    with pytest.raises(SourceError, match=r"images\.txt:6: `nan`: expected a number: .* give the model as \.bin"):
+        read_model(tmp_path)
+    model.write(sparse / "1")
+    (result,) = hodge_pipeline.refine_colmap(sparse / "1", overrides=FREE).results
+    assert result.start.quality.points == model.num_points3D()
+    next(point for point in image.points2D if point.has_point3D()).xy = np.array([np.nan, np.nan])
+    model.write(sparse / "1")
+    with pytest.raises(SourceError, match=f"image '{image.name}': an observation is not finite"):
+        read_model(sparse / "1")
 
 
 def test_a_name_of_two_images_is_told(sparse: Path) -> None:

@@ -49,6 +49,8 @@ def test_what_holds_nothing_or_something_packed_is_told_so(tmp_path: Path) -> No
     assert complaint(tmp_path / "folder").endswith("unpack bag.tar.xz first")
     (tmp_path / "graph.g2o.gz").write_bytes(b"\x1f\x8b")
     assert complaint(tmp_path / "graph.g2o.gz").endswith(": packed: unpack it first")
+    (tmp_path / "scan.ptx").write_text("2\n2\n0 0 0\n")
+    assert complaint(tmp_path / "scan.ptx").endswith(": a scan of another format: convert to PLY")
 
 
 def test_images_of_another_format_are_told_what_to_become(tmp_path: Path) -> None:

@@ -68,11 +68,20 @@ def _opened(reader: FrameReader, path: Path) -> tuple[Source, CameraError | None
         return replace(any_reader, camera=(width, width, width / 2, height / 2)).open(path), error
 
 
+def _require_some(path: Path, facts: dict[str, Any]) -> None:
+    faults = facts["unreadable among them"]
+    if faults and not facts["frames looked into"]:
+        none = "" if len(faults) == 1 else f"{path}: none of the {len(faults)} frames looked into can be read: "
+        raise SourceError(none + faults[0])
+
+
 def inspect(path: Path, reader: FrameReader | None = None) -> dict[str, Any]:
     """Facts of a path as plain data: guesses, frames, stamps, cameras, depth, poses, graph, notes, oddities.
 
     The surest reader opens it where none is given; only the depth of a few frames is read. Facts without a value are
     left out. `missing` lists options that the reader needs.
+
+    Raises `SourceError` where none of the frames looked into can be read.
     """
     known = guesses(path) if path.is_file() or path.is_dir() else []
     taken = reader or guess_reader(path, known)
@@ -86,6 +95,7 @@ def inspect(path: Path, reader: FrameReader | None = None) -> dict[str, Any]:
     }
     if source.frames:
         facts.update(frame_facts(source.frames, oddities, unit))
+        _require_some(path, facts)
     if getattr(taken, "depth_scale", 0) is not None:  # a scale of the user's, or of another format than TUM's
         facts.pop("missing", None)
     if camera_error is not None:

@@ -113,7 +113,8 @@ def _has_reflectance(table: Floats32) -> bool:
 def _median_step(points: Floats32) -> float:
     if len(points) < 2:
         return 0.0
-    steps = np.linalg.norm(np.diff(points.astype(float), axis=0), axis=1)
+    with np.errstate(invalid="ignore"):
+        steps = np.linalg.norm(np.diff(points.astype(float), axis=0), axis=1)
     return float(np.median(np.nan_to_num(steps, nan=np.inf)))
 
 

@@ -52,5 +52,8 @@ def _table(path: Path) -> NDArray[Any]:
     try:
         with reading(path):
             return np.asarray(np.lib.format.open_memmap(path, mode="r"))
-    except (ValueError, EOFError) as error:
-        raise SourceError(f"{path}: no .npy file of numbers ({error}): save it again") from error
+    except SourceError:
+        raise
+    except Exception as error:  # the header is Python: numpy raises whatever its tokenizer and its types do
+        words = " ".join(str(error).split())[:200]
+        raise SourceError(f"{path}: no .npy file of numbers ({words}): save it again") from error

@@ -66,7 +66,10 @@ class CloudFolderReader:
             return Sniff(0.0, "not a folder that can be read")
         count = sum(map(_is_scan, names))
         if not count:
-            return Sniff(0.0, f"no {', '.join(ENDINGS)}")
+            is_other = path.is_file() and path.suffix.lower() in OTHER_SCANS
+            return Sniff(
+                0.0, f"no {', '.join(ENDINGS)}", "a scan of another format: convert to PLY" if is_other else ""
+            )
         return Sniff(
             0.8 if count * 2 > len(names) else 0.4, f"{count} point clouds among {counted(len(names), 'file')}"
         )

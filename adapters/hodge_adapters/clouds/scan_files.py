@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hodge_adapters.clouds.columns import COLOURS, ROWS_IN_PART, ZERO, Columns, Corner, parts_of
+from hodge_adapters.clouds.columns import COLOURS, MAX_METRES, ROWS_IN_PART, ZERO, Columns, Corner, parts_of
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
@@ -25,6 +25,8 @@ MAX_POINTS_A_BYTE, ALWAYS_POINTS = 4, 1 << 20
 """LAZ and E57 store a scanner's points in 1 to 20 bytes each, equal ones in next to none: more points than this for
 each byte of a file, past the first million, are no scan."""
 
+FIRST_POINTS = 1000
+"""Of a LAS file, to compare with its header: less than LAZ decompresses at once (50,000)."""
 LAS_TIME = "gps_time"
 """Read of files of one part at most: no sweep has more points, and the times of a survey take as much as these."""
 LAS_HEADER, LAS_14_HEADER = 227, 375
@@ -32,6 +34,12 @@ LAS_HEADER, LAS_14_HEADER = 227, 375
 RECORD_HEADER, EXTENDED_RECORD_HEADER = 54, 60
 E57_HEADER, E57_PAGE, MAX_XML_BYTES = 48, 1024, 1 << 26
 """Bytes of the file header, of a page with its checksum (ASTM E2807, 8.3), and of the XML of ten thousand scans."""
+E57_POINTS = ("cartesianX", "cartesianY", "cartesianZ")
+E57_COLOURS = ("colorRed", "colorGreen", "colorBlue")
+E57_INVALID = "cartesianInvalidState"
+E57_NAMES = dict(zip((*E57_POINTS, *E57_COLOURS), (*"xyz", *COLOURS), strict=True))
+E57_FIELDS = dict.fromkeys(E57_POINTS, np.float64) | dict.fromkeys(E57_COLOURS, np.float32) | {E57_INVALID: np.int8}
+"""Colours are integers of any width or fractions (ASTM E2807, 8.4.4): float32 holds 8 and 16 bits exactly."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +51,8 @@ class Scan:
 
 
 def las_corner(paths: Sequence[Path], units_per_metre: float, *, is_all: bool = True) -> Corner | None:
-    """The whole metres in the middle of those of these files that can be opened, in their units, from their headers;
-    zero where zero is nearer to them than they are large: these are in a scanner's axes.
+    """The whole metres in the middle of those of these files that can be opened, in their units; zero where zero is
+    nearer to them than they are large: these are in a scanner's axes.
 
     None where there is no such file; `is_all`: raises `SourceError` then, since no other file is there to be read.
     """
@@ -53,7 +61,7 @@ def las_corner(paths: Sequence[Path], units_per_metre: float, *, is_all: bool = 
         try:
             with _named(path, "laspy"), _opened_las(path) as file:
                 _check_points(path, file.header.point_count)
-                corners.append(np.array([file.header.mins, file.header.maxs], float))
+                corners.append(_las_box(file))
         except SourceError as error:  # said again where the cloud is read
             fault = error
     if not corners:
@@ -67,6 +75,23 @@ def las_corner(paths: Sequence[Path], units_per_metre: float, *, is_all: bool = 
         return ZERO
     x, y, z = (units_per_metre * np.round((low + high) / 2 / units_per_metre)).tolist()
     return x, y, z
+
+
+def _las_box(file: Any) -> Floats:
+    """The lowest and highest coordinates (2, 3) that the header says, unless most of the first points lie outside: some
+    software writes zeros there, or the integers that are stored. Then those of the first part.
+    """
+    said = np.array([file.header.mins, file.header.maxs], float)
+    points = _coordinates(file.read_points(FIRST_POINTS))
+    outside = ~((points > said[0] - 1) & (points < said[1] + 1)).all(axis=1)  # of a corner in whole metres
+    if 2 * outside.sum() <= len(points):
+        return said
+    points = np.concatenate([points, _coordinates(file.read_points(ROWS_IN_PART))])
+    return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
+def _coordinates(part: Any) -> Floats:
+    return np.column_stack([np.asarray(part[axis], float) for axis in "xyz"])
 
 
 def _check_counts(path: Path) -> None:
@@ -87,15 +112,24 @@ def _check_counts(path: Path) -> None:
 def las_parts(path: Path) -> Iterator[Columns]:
     """The points of a LAS or LAZ file as columns, in parts."""
     with _named(path, "laspy"), _opened_las(path) as file:
-        _check_points(path, file.header.point_count)
-        is_sweep = file.header.point_count <= ROWS_IN_PART
-        yield from (_las_columns(part, is_sweep) for part in _las_chunks(file))
+        said, found = file.header.point_count, 0
+        _check_points(path, said)
+        for part in _las_chunks(file):
+            found += len(part)
+            yield _las_columns(part, said <= ROWS_IN_PART)
+        if found < said:  # laspy is content with those that are there
+            raise SourceError(f"{path}: says {said} points, has {found}: copy it again")
 
 
 def _opened_las(path: Path) -> Any:
     package = library("laspy", path)
     _check_counts(path)
-    return package.open(open_input(path), closefd=True)
+    file = package.open(open_input(path), closefd=True)
+    scales, offsets = np.asarray(file.header.scales, float), np.asarray(file.header.offsets, float)
+    if not (np.isfinite(scales) & (scales != 0) & (np.abs(offsets) < MAX_METRES)).all():
+        file.close()
+        raise ValueError(f"scales {scales.tolist()} and offsets {offsets.tolist()} of its coordinates")
+    return file
 
 
 def _check_points(path: Path, count: int) -> None:
@@ -139,13 +173,25 @@ def e57_parts(path: Path, row: int = 0) -> Iterator[Columns]:
     with _named(path, "pye57"):
         file = _opened_e57(path)
         _check_points(path, file.get_header(row).point_count)
-        scan = file.read_scan_raw(row)
-        good = np.asarray(scan.get("cartesianInvalidState", np.zeros(len(scan["cartesianX"])))) == 0
-        columns = {name: np.asarray(scan[f"cartesian{name.upper()}"])[good] for name in "xyz"}
-        if "colorRed" in scan:
-            for name in ("Red", "Green", "Blue"):
-                columns[name.lower()] = np.asarray(scan[f"color{name}"])[good]
+        columns = _e57_columns(file, row)
     yield from parts_of(columns)
+
+
+def _e57_columns(file: Any, row: int) -> dict[str, Any]:
+    """The valid points of a scan and their colours, and nothing else: pye57 refuses what it has no type for, such as
+    stamps and normals, and colours of 16 bits in its own buffers.
+    """
+    header, libe57 = file.get_header(row), importlib.import_module("pye57.libe57")
+    if not {*E57_POINTS} <= {*header.point_fields}:
+        raise ValueError(f"scan {row} has {', '.join(header.point_fields)}, not {', '.join(E57_POINTS)}")
+    wanted = E57_FIELDS if {*E57_COLOURS} <= {*header.point_fields} else E57_FIELDS.keys() - {*E57_COLOURS}
+    scan = {field: np.empty(header.point_count, E57_FIELDS[field]) for field in wanted if field in header.point_fields}
+    buffers = libe57.VectorSourceDestBuffer()
+    for field, values in scan.items():
+        buffers.append(libe57.SourceDestBuffer(file.image_file, field, values, len(values), True, True))
+    header.points.reader(buffers).read()
+    good = scan.pop(E57_INVALID, np.zeros(header.point_count, np.int8)) == 0
+    return {E57_NAMES[field]: values[good] for field, values in scan.items()}
 
 
 def _opened_e57(path: Path) -> Any:
@@ -182,6 +228,7 @@ class _named:
         return None
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, Exception) and not isinstance(error, SourceError):
+        is_fault = isinstance(error, Exception) or type(error).__name__ == "PanicException"  # of laspy's Rust
+        if is_fault and not isinstance(error, SourceError):
             words = " ".join(str(error).split())[:200] or type(error).__name__
             raise SourceError(f"{self.path}: {self.package} cannot read it ({words}): convert it to PLY") from error

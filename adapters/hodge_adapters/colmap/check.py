@@ -39,13 +39,29 @@ def check_files(paths: Sequence[Path]) -> None:
 def check_words(paths: Sequence[Path]) -> None:
     """Raise `SourceError` with file and line of a word in text files that is no number where COLMAP has one."""
     for path in paths:
+        if path.stem == "images":
+            _check_image_words(path)
+            continue
         for line, text in text_lines(path):
-            words = text.split(maxsplit=9)[:9] if path.stem == "images" and _is_pose(text) else text.split()
+            words = text.split()
             if path.stem == "cameras" and words[1] not in _camera_models():
                 raise SourceError(f"{path}:{line}: has a camera of the unknown model {words[1][:60]}: {REMEDY}")
             numbers = [word for word in words if word not in _SENSORS and word not in _camera_models()]
             if numbers and not np.isfinite(to_floats(numbers) or np.nan).all():
                 raise _fault(path, line, text, "numbers")
+
+
+def _check_image_words(path: Path) -> None:
+    for line, pose, seen in _image_lines(path):
+        if not np.isfinite(to_floats(pose.split(maxsplit=9)[:9]) or np.nan).all():
+            raise _fault(path, line, pose, "numbers")
+        words = seen.split()
+        if words and not np.isfinite(to_floats(words) or np.nan).all():
+            word = next(word for word in words if not np.isfinite(to_floats([word]) or np.nan).all())
+            raise SourceError(
+                f"{path}:{line + 1}: `{word[:60]}`: expected a number: COLMAP writes features that are none, and does "
+                "not read them: give the model as .bin"
+            )
 
 
 def image_count(path: Path) -> int:

@@ -17,6 +17,7 @@ from hodge_adapters.colmap.check import REMEDY, check_files, check_words, names_
 from hodge_adapters.colmap.files import MODEL_FILES, model_ending
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 from hodge_adapters.colmap.records import NO_POINT, CameraRecord, ImageRecord, Model, matrix_of
+from hodge_adapters.posed import length_notes
 from hodge_adapters.text_rows import natural
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
@@ -26,7 +27,7 @@ from hodge_pipeline.types.text import counted
 MOST_PIXELS = 1 << 16
 """Across an image: wider ones are no photographs, and buffers of that size would be asked for."""
 OFF_UNIT = 1e-6
-"""How far from 1 the length of a quaternion may be: pycolmap leaves zero as it is and divides all others by theirs."""
+"""How far from 1 the length of a quaternion may be: pycolmap takes those of a model without rigs as they are."""
 REFUSALS = (
     (
         r"point2D\.point3D_id == point3D_id \((\d+) vs\. (\d+)\)",
@@ -107,10 +108,12 @@ def content_of(reconstruction: pycolmap.Reconstruction, tracks: bool = True) -> 
 
 
 def checked_content(reconstruction: pycolmap.Reconstruction, where: Path, tracks: bool = True) -> Model:
-    """The content, if its numbers can be a model's; points that are not finite are taken out of the model and noted.
+    """The content, if its numbers can be a model's; points that are not finite are taken out of the model, quaternions
+    of another length than 1 divided by it, and both noted.
 
     Raises `SourceError`.
     """
+    notes = _normalise(reconstruction)
     try:
         content = content_of(reconstruction, tracks)
         lost = content.points.ids[~np.isfinite(content.points.xyz).all(axis=1)].tolist()
@@ -127,12 +130,27 @@ def checked_content(reconstruction: pycolmap.Reconstruction, where: Path, tracks
         raise SourceError(f"{where}: an image is of a sensor whose place on its rig is not known: {REMEDY}") from error
     _check(content, where)
     for image in content.images:
-        turn = reconstruction.images[image.image_id].cam_from_world().rotation.quat
-        if not abs(float(np.linalg.norm(turn)) - 1.0) < OFF_UNIT or not se3.is_motion(image.world_from_cam):
-            raise SourceError(
-                f"{where}: image {image.name!r}: its quaternion is zero, or a number is none or past {se3.MAX_NUMBER:g}"
-            )
-    return replace(content, notes=(f"{counted(len(lost), 'point')} not finite: left out",)) if lost else content
+        length = float(np.linalg.norm(reconstruction.images[image.image_id].cam_from_world().rotation.quat))
+        if not abs(length - 1.0) < OFF_UNIT or not se3.is_motion(image.world_from_cam):
+            is_other = np.isfinite(length) and abs(length - 1.0) >= OFF_UNIT
+            why = f"is of length {length:.7g}, not 1" if is_other else f"or position is none or past {se3.MAX_NUMBER:g}"
+            raise SourceError(f"{where}: image {image.name!r}: its quaternion {why}: mend it, or register it again")
+    notes += [f"{counted(len(lost), 'point')} not finite: left out"] if lost else []
+    return replace(content, notes=tuple(notes))
+
+
+def _normalise(reconstruction: pycolmap.Reconstruction) -> list[str]:
+    """A note where poses have quaternions of other lengths than 1, such as rounded ones: they are divided by theirs,
+    since bundle adjustment takes them for rotations as they are.
+    """
+    frames = [frame for frame in reconstruction.frames.values() if frame.has_pose()]
+    quats = np.array([frame.rig_from_world.rotation.quat for frame in frames]).reshape(-1, 4)
+    lengths = np.linalg.norm(quats, axis=1)
+    good = (lengths > 1 / se3.MAX_NUMBER) & (lengths < se3.MAX_NUMBER)
+    for row in np.flatnonzero(good & (np.abs(lengths - 1) >= OFF_UNIT)).tolist():
+        turn = pycolmap.Rotation3d(quats[row] / lengths[row])
+        frames[row].rig_from_world = pycolmap.Rigid3d(turn, frames[row].rig_from_world.translation)
+    return length_notes(quats[good], "poses")
 
 
 def refreshed(model: Model, reconstruction: pycolmap.Reconstruction, xyz: Floats | None = None) -> Model:
@@ -195,7 +213,8 @@ def _check(model: Model, where: Path) -> None:
     if twice:
         raise SourceError(f"{where}: two images have the name {twice[0]!r}: rename one, or leave it out")
     for image in model.images:
-        if not np.isfinite(image.pixels).all():
+        # features of no point may be none: COLMAP undistorts those beyond what a lens model can do to NaN
+        if not np.isfinite(image.pixels[image.point_ids != NO_POINT]).all():
             raise SourceError(f"{where}: image {image.name!r}: an observation is not finite: reconstruct it again")
         lost = image.point_ids[(image.point_ids != NO_POINT) & (model.points.rows_of(image.point_ids) < 0)]
         if lost.size:
