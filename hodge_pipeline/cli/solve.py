@@ -87,15 +87,13 @@ def solve(
         keep_source(path, out)
     with ProgressBars.of(shown) as terminal, terminal.stage("solve", 1):
         solved = solve_file(path, options)
-    if out is not None:
-        write_solved(out, solved, _writer(out, solved.source))
-    left_out: tuple[str, ...] = ()
+    left_out = () if out is None else write_solved(out, solved, _writer(out, solved.source))
     if run_folder is not None:
         from hodge_pipeline.report.solved import write_run_folder
 
-        left_out = write_run_folder(run_folder, solved)
+        left_out += write_run_folder(run_folder, solved)
     summary = solved.summary()
-    summary["notes"] += left_out
+    summary["notes"] += dict.fromkeys(left_out)
     if shown.as_json:
         print_json({"source": str(solved.source.path), "out": None if out is None else str(out), **summary})
     elif not shown.quiet:

@@ -211,16 +211,18 @@ def _solved(graph: ViewGraph, start: Floats | None, options: SolveOptions) -> So
     )
 
 
-def write_solved(path: Path, solved: SolvedFile, writer: str = "g2o") -> None:
+def write_solved(path: Path, solved: SolvedFile, writer: str = "g2o") -> tuple[str, ...]:
     """Write the solved poses; a writer of graphs also gets every edge as measured, ignored ones too, in the order read.
 
-    A writer of poses gets them in the order of the vertices' numbers.
+    A writer of poses gets them in the order of the vertices' numbers. Gives what the format lost, a line each.
     """
     poses, graph = solved.solution.world_from_cam, solved.graph
     trajectory = Trajectory(np.arange(len(poses), dtype=float), poses)
     if writer not in GRAPH_WRITERS:
         trajectory = vertex_trajectory(graph, poses)
-    registry.load("writers", writer)().write(path, replace(solved.source, trajectory=trajectory))
+    graph_alone = replace(solved.source, frames=(), trajectory=trajectory)
+    told: tuple[str, ...] = registry.load("writers", writer)().write(path, graph_alone)
+    return told[1:]
 
 
 def vertex_trajectory(graph: ViewGraph, world_from_vertex: Floats) -> Trajectory:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -49,11 +48,8 @@ def write_pose_table(folder: Path, source: Source, world_from_cam: Floats) -> No
 
 def write_graph(folder: Path, source: Source, last: Round) -> None:
     """`graph.g2o` (vertices by frame number, or by row where frames have names) and `edges.csv`."""
-    graph = last.graph
-    ids = graph.vertex_ids if graph.vertex_ids.dtype.kind == "i" else np.arange(graph.vertex_count)
-    numbered = dataclasses.replace(graph, vertex_ids=ids)
-    trajectory = Trajectory(np.arange(graph.vertex_count, dtype=float), last.world_from_cam)
-    whole = Source(source.name, source.path, trajectory=trajectory, graph=numbered)
+    trajectory = Trajectory(np.arange(last.graph.vertex_count, dtype=float), last.world_from_cam)
+    whole = Source(source.name, source.path, trajectory=trajectory, graph=last.graph)
     registry.load("writers", "g2o")().write(folder / "graph.g2o", whole)
     write_edges(folder / "edges.csv", last.edges, last.vertex_ids)
 

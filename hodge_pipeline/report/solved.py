@@ -24,17 +24,18 @@ from hodge_pipeline.types.text import counted
 
 
 def write_run_folder(folder: Path, solved: SolvedFile) -> tuple[str, ...]:
-    """Write the folder, made if it is not there; what the recording left out, in words."""
+    """Write the folder, made if it is not there; what the graph's file and the recording left out, in words."""
     make_folder(folder, "--run")
-    write_solved(folder / RUN_GRAPH, solved)
-    edges = _edges(solved)
-    write_edges(folder / "edges.csv", edges, solved.graph.vertex_ids)
+    lost, edges = write_solved(folder / RUN_GRAPH, solved), _edges(solved)
+    write_edges(folder / "edges.csv", edges, solved.graph.vertex_ids, has_metres=solved.source.in_metres)
     artifacts.write_json(folder / SOLVED, solved.summary())
     write_report(folder, _report(solved, edges))
     source, solution = solved.source, solved.solution
     start = solution.world_from_cam if solved.start is None else solved.start
     sets, is_scanner = _before(solved), not source.of_cameras
-    return record_graph(folder, source.name, solved.graph, start, solution, sets, source.notes, is_scanner=is_scanner)
+    return lost + record_graph(
+        folder, source.name, solved.graph, start, solution, sets, source.notes, is_scanner=is_scanner
+    )
 
 
 def _edges(solved: SolvedFile) -> Edges:
@@ -80,4 +81,5 @@ def _report(solved: SolvedFile, edges: Edges) -> Report:
             Pictures.of_graph(sets, graph, solution.component),
             convergence={"solve": tuple(step.objective for step in solution.history)},
         ),
+        has_metres=source.in_metres,
     )
