@@ -26,10 +26,10 @@ from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.setup import InitialName
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.sources.unknown import without_frames
+from hodge_pipeline.store.workspace import GRAPH_FILE
 from hodge_pipeline.types import Bools, Floats, Solution, Source, Trajectory, ViewGraph
 from hodge_pipeline.types.text import command, counted
 
-RUN_GRAPH = "graph.g2o"
 ROUNDING = 1e-15
 """Share of the first cost that rounding leaves of one that vanishes."""
 GRAPH_WRITERS = ("g2o", "open3d_pose_graph")
@@ -140,7 +140,7 @@ def read_graph(path: Path) -> Source:
 
     Raises `SourceError` where there is no graph.
     """
-    path = path / RUN_GRAPH if (path / RUN_GRAPH).is_file() else path
+    path = path / GRAPH_FILE if (path / GRAPH_FILE).is_file() else path
     reader = guess_reader(path)
     source = reader.open(path)
     if source.graph is None:

@@ -19,6 +19,7 @@ from hodge_pipeline.scene import Round, Scene, sequences_of
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.store import Store
+from hodge_pipeline.store.workspace import EDGES_FILE, GRAPH_FILE
 from hodge_pipeline.types import Floats, Source, Trajectory
 from hodge_pipeline.types.text import cell, csv_text, file_stems
 
@@ -50,8 +51,8 @@ def write_graph(folder: Path, source: Source, last: Round) -> None:
     """`graph.g2o` (vertices by frame number, or by row where frames have names) and `edges.csv`."""
     trajectory = Trajectory(np.arange(last.graph.vertex_count, dtype=float), last.world_from_cam)
     whole = Source(source.name, source.path, trajectory=trajectory, graph=last.graph)
-    registry.load("writers", "g2o")().write(folder / "graph.g2o", whole)
-    write_edges(folder / "edges.csv", last.edges, last.vertex_ids)
+    registry.load("writers", "g2o")().write(folder / GRAPH_FILE, whole)
+    write_edges(folder / EDGES_FILE, last.edges, last.vertex_ids)
 
 
 def write(
