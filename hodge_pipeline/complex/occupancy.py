@@ -37,7 +37,7 @@ def voxel_occupancy(
 
     The row of a frame without points, or with a pose that is not finite, is empty.
     """
-    finite = np.asarray(np.isfinite(world_from_cam).all(axis=(1, 2)))
+    finite = se3.has_pose(world_from_cam)
     origin = np.floor(world_from_cam[finite][:1, :3, 3].sum(axis=0) / voxel_m).astype(np.int64)
     nothing = np.zeros(0, np.int64)
     keys = [
