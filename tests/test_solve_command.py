@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 import hodge_pipeline
+from backbone_graphs import drive
 from hodge_adapters.pose_graphs.g2o import load_g2o, write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
@@ -19,7 +20,6 @@ from hodge_pipeline.refine.pose_graph import UNTOLD, SolvedFile, SolveOptions, d
 from hodge_pipeline.report.solved import write_run_folder
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.types import Source, ViewGraph
-from tests.backbone_graphs import drive
 
 
 def graph_file(path: Path, planar: bool = False) -> ViewGraph:
