@@ -15,8 +15,8 @@ from backbone_graphs import drive
 from hodge_adapters.pose_graphs.g2o import load_g2o, write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
-from hodge_pipeline.errors import CheckError, GraphError, HodgeError, RecipeError, SourceError
-from hodge_pipeline.refine.pose_graph import UNTOLD, SolvedFile, SolveOptions, disabled_edges, solve_file
+from hodge_pipeline.errors import CheckError, GraphError, HodgeError, RecipeError, SourceError, WorkspaceError
+from hodge_pipeline.refine.pose_graph import UNTOLD, SolvedFile, SolveOptions, disabled_edges, read_graph, solve_file
 from hodge_pipeline.report.solved import write_run_folder
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.types import Source, ViewGraph
@@ -114,6 +114,10 @@ def test_a_graph_with_names_and_without_metres_is_left_as_such(tmp_path):
     assert "residual_units" in header.split(",") and "residual_m" not in header.split(",") and ".jpg" in first
     page = re.sub(r"<style.*?</style>|<[^>]*>", " ", (tmp_path / "run/report.html").read_text(), flags=re.DOTALL)
     assert not re.search(r"\d (mm|cm|m)\b", page)
+    assert not read_graph(tmp_path / "run").in_metres
+    (tmp_path / "run/solved.json").write_text("[]")
+    with pytest.raises(WorkspaceError, match=r"solved\.json: is not what a solve writes"):
+        read_graph(tmp_path / "run")
 
 
 def test_the_certificate_is_told(tmp_path):
