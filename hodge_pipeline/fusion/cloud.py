@@ -19,6 +19,7 @@ from hodge_pipeline.types.cell_keys import REACH, cells_of_keys, keys_of_cells
 from hodge_pipeline.types.text import counted
 
 POINTS_AT_ONCE = 1 << 20
+"""Of a frame, moved to the world: so a scan of any size takes some tens of megabytes."""
 
 MAX_STEP = 0.05
 """Share of the depth: a larger step between neighbouring pixels is an occlusion edge, which has no normal."""
