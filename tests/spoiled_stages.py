@@ -174,15 +174,6 @@ def more_inliers(found: Any, *_: Any) -> Any:
     return replace(found, inliers=found.matches + 1)
 
 
-def by_identity(found: Any, target: Any, source: Any) -> Any:
-    seen = id(target) in SEEN
-    SEEN.add(id(target))
-    return replace(found, matches=found.matches + seen)
-
-
-SEEN: set[int] = set()
-
-
 def some_inliers(found: Any, *_: Any) -> Any:
     return replace(found, inliers=max(found.inliers, 1), matches=max(found.matches, 1))
 

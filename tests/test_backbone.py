@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from backbone_graphs import Drive, drive, round_trip
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import WRONG_BELOW, DiagnosisOptions
@@ -22,7 +23,6 @@ from hodge_pipeline.solvers.backbone.sparse import NormalEquations
 from hodge_pipeline.solvers.backbone.trust import find_backbone, of_every_loop
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import ViewGraph
-from tests.backbone_graphs import Drive, drive, round_trip
 
 NEVER_WORSE = 1.02
 

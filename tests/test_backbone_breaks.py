@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from backbone_graphs import WORLDS, blocks, broken, drive, spanned
 from benchmarks.spoilt_graphs import simulated_cases
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.types import ViewGraph
-from tests.backbone_graphs import WORLDS, blocks, broken, drive, spanned
 
 BROKEN_TOWNS: dict[str, tuple[int, dict[str, Any]]] = {
     "in places that tell little": (82, {"seed": 323, "count": 200, "dimension": 3, "wrong": 0.6, "in_groups": True}),

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from backbone_graphs import drive
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.robust import solve_robust
@@ -15,8 +16,7 @@ from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.solvers.backbone.credible import credible_steps
 from hodge_pipeline.solvers.backbone.sequence import sequential_edges
 from hodge_pipeline.types import Floats, ViewGraph
-from tests.backbone_graphs import drive
-from tests.test_backbone import NEVER_WORSE
+from test_backbone import NEVER_WORSE
 
 OF_ROBOTS = np.diag([1e-6, 1e-6, 1e-3, 1e3, 1e3, 1e-6])
 """The information of a wheeled base's odometry in many ROS drivers: 1e6 for height, roll and pitch, 1e3 for heading."""

@@ -9,6 +9,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
+from backbone_graphs import Drive, at_one_place, broken, drive, round_trip
 from benchmarks.spoilt_graphs import lattice_cases
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
@@ -16,8 +17,7 @@ from hodge_pipeline.solvers.backbone import bridged, inference
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.types import Floats, ViewGraph
-from tests.backbone_graphs import Drive, at_one_place, broken, drive, round_trip
-from tests.test_backbone import NEVER_WORSE
+from test_backbone import NEVER_WORSE
 
 
 @pytest.mark.parametrize(("seed", "stated"), [(5010, True), (5019, False)])

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from backbone_graphs import at_one_place, drive
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.types import ViewGraph
-from tests.backbone_graphs import at_one_place, drive
 
 
 @pytest.fixture(scope="module")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from backbone_graphs import drive
 from hodge_pipeline.solvers.backbone.lattice import lattice_backbone
 from hodge_pipeline.solvers.backbone.step_tests import left_out_steps
 from hodge_pipeline.solvers.backbone.trust import Backbone, find_backbone
 from hodge_pipeline.types import Bools, Ints, ViewGraph
-from tests.backbone_graphs import drive
 
 STEPS = 119
 

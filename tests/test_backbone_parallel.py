@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from backbone_graphs import STEP, drive
 from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import has_unit_information, in_vertex_order
 from hodge_pipeline.diagnosis.diagnosis import diagnose
@@ -14,8 +15,7 @@ from hodge_pipeline.solvers.backbone.parallel import FEWEST, fused, loops_once
 from hodge_pipeline.solvers.backbone.sequence import consecutive_edges
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.types import Ints, ViewGraph
-from tests.backbone_graphs import STEP, drive
-from tests.test_backbone_window import with_window
+from test_backbone_window import with_window
 
 
 def with_second_odometry(

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from backbone_graphs import Drive, at_one_place, drive, field, two_laps
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.places import Arrangement, Places
 from hodge_pipeline.solvers.backbone.trust import find_backbone
-from tests.backbone_graphs import Drive, at_one_place, drive, field, two_laps
-from tests.test_backbone import NEVER_WORSE, chain_of
-from tests.test_solver_robust import rings, spoiled
+from test_backbone import NEVER_WORSE, chain_of
+from test_solver_robust import rings, spoiled
 
 
 def city(monkeypatch: pytest.MonkeyPatch, seed: int) -> Drive:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from backbone_graphs import Drive, drive
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.result import UNTESTABLE
 from hodge_pipeline.solvers.backbone.sequence import consecutive_edges
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Bools, ViewGraph
-from tests.backbone_graphs import Drive, drive
 
 CUT = 300
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from backbone_graphs import drive
 from hodge_pipeline import se3
 from hodge_pipeline.complex.closing import cycle_errors
 from hodge_pipeline.diagnosis.diagnosis import diagnose
@@ -16,7 +17,6 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone import inference
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.types import Priors, ViewGraph
-from tests.backbone_graphs import drive
 
 
 @pytest.mark.parametrize(("world", "count"), [("town", 60), ("corridor", 60), ("room", 90)])

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from backbone_graphs import STEP, Drive, drive
 from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import has_unit_information
 from hodge_pipeline.diagnosis.diagnosis import diagnose
@@ -17,7 +18,6 @@ from hodge_pipeline.solvers.backbone.sequence import consecutive_edges
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.solvers.backbone.window import windowed
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
-from tests.backbone_graphs import STEP, Drive, drive
 
 
 def with_window(made: Drive, reach: int, *, wrong: float = 0.0, seed: int = 0) -> tuple[Drive, Ints]:

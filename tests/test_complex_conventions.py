@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from backbone_graphs import drive
 from hodge_pipeline import se3
 from hodge_pipeline.complex.conventions import inverted_notes, nearest_tree
 from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.types import ViewGraph
-from tests.backbone_graphs import drive
 
 
 def inverted(graph: ViewGraph) -> ViewGraph:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from backbone_graphs import Drive
 from diagnosis_graphs import SIGMA, measured, near_pairs, poses_on_a_ring, spoiled
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
@@ -20,7 +21,6 @@ from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import ConsistencySolver, Step, no_progress
 from hodge_pipeline.types import Edges, ViewGraph
 from hodge_pipeline.types.edges import IGNORED, MEASURED, USED
-from tests.backbone_graphs import Drive
 
 QUICK = DiagnosisOptions()
 

@@ -7,6 +7,7 @@ import runpy
 import shlex
 import shutil
 from dataclasses import fields
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,14 @@ def test_every_command_parses(page: Path) -> None:
             assert rest and rest[0] in group.commands, f"{page.name}: hodge {shlex.join(words)}"
             group, rest = group.commands[rest[0]], rest[1:]
         group.make_context("hodge", [word for word in rest if word != ">"][: None if ">" not in rest else -1])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_option_of_a_run_is_one_of_its_recipe(page: Path) -> None:
+    for command, recipe, *rest in [words for words in commands(page) if len(words) > 1]:
+        sets = [change for flag, change in pairwise(rest) if flag == "--set"]
+        if command == "run" and not recipe.endswith(".yaml"):
+            load_recipe(recipe, sets)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

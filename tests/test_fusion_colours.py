@@ -12,7 +12,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.fusion import block_grid, tsdf
 from hodge_pipeline.fusion.block_grid import BlockGrid
 from hodge_pipeline.fusion.tsdf import TsdfFuser
-from tests.test_fusion import CAMERA, WALL_COLOURS, box_frames, colour_of
+from test_fusion import CAMERA, WALL_COLOURS, box_frames, colour_of
 
 
 def test_colours_of_some_views_do_for_all(monkeypatch: pytest.MonkeyPatch) -> None:

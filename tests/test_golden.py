@@ -23,7 +23,6 @@ def beginning(source: Path, until: str, folder: Path) -> Path:
     return folder
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", GOLDEN)
 def test_a_recipe_reaches_its_golden_numbers(name: str, data_dir: Path, tmp_path: Path) -> None:
     golden: dict[str, Any] = GOLDEN[name]

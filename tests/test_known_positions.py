@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,10 +16,11 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.report import known_positions as shown
+from hodge_pipeline.rounds.one_round import Work
 from hodge_pipeline.solvers.positions import Fixes, align_positions, place
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.testing import check_reader
-from hodge_pipeline.types import Floats, ViewGraph
+from hodge_pipeline.types import CloudSet, Floats, PointCloud, ViewGraph
 from hodge_pipeline.types.positions import earth_centred
 from mcap_data import Log
 from mcap_encoding import JSON
@@ -248,6 +250,15 @@ def test_positions_on_a_line_leave_the_scanner_upright(heading: float, exact: bo
         fixes = replace(fixes, points=true[:, :3, 3], stated=np.zeros(frames, bool))
     found = place(graph, odometry, np.zeros(frames, np.int64), np.ones(39), fixes, UP)
     assert found.world_from_cam[:, 2, 2].min() > np.cos(np.radians(15))
+
+
+@pytest.mark.parametrize(("nearest_z", "up"), [(0.5, [0, -1, 0]), (-1.0, [0, 0, 1])])
+def test_clouds_tell_which_way_their_sensor_is_up(nearest_z: float, up: list[float]) -> None:
+    """A depth camera's clouds have no point behind it, a scanner's have the ground."""
+    points = np.random.default_rng(0).uniform([-1, -1, nearest_z], [1, 1, 2], (100, 3)).astype(np.float32)
+    scene = SimpleNamespace(clouds=CloudSet.from_clouds([PointCloud(points)]))
+    work = Work(None, None, scene, None, None)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(work._up(np.eye(4)[None]), up)
 
 
 def test_points_are_aligned_in_spite_of_wrong_ones() -> None:

@@ -26,7 +26,6 @@ print(len(frames), int(re.search(r"VmHWM:\s+(\d+) kB", status)[1]) / 1024)
 """
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="the peak of memory is read from /proc")
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4], ids=["none", "lz4"])
 def test_memory_of_a_large_recording(tmp_path: Path, compression: CompressionType) -> None:

@@ -93,7 +93,6 @@ def test_stages_without_anything_to_show(tmp_path: Path) -> None:
     verify(tmp_path / "recording.rrd", tmp_path)
 
 
-@pytest.mark.slow
 def test_it_opens_on_trajectories_and_edges(tmp_path: Path) -> None:
     recorder = record(tmp_path / "parts")
     record_all(recorder)

@@ -289,7 +289,6 @@ def test_every_rewriter_has_the_name_of_a_reader() -> None:
     assert set(registry.names("rewriters")) <= set(registry.names("readers"))
 
 
-@pytest.mark.slow
 def test_the_loop_that_open3d_left_open_is_closed(data_dir: Path, tmp_path: Path) -> None:
     """True relative poses of living room 1: gt.log of its fragments, moved by the origin that Redwood chose.
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from diagnosis_graphs import every_pair_tried
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.solvers.resistance import EXACT_TO, Network, effective_resistance
 from hodge_pipeline.types import Floats, Ints
-from tests.diagnosis_graphs import every_pair_tried
 
 
 def resistance(edges: Ints, count: int) -> Floats:

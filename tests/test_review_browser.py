@@ -36,7 +36,7 @@ from review_page import Page, start_browser, why_no_browser
 sys.path.append(str(Path(__file__).resolve().parents[1] / "docs"))
 from make_which_edge import write_loops  # noqa: E402
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(why_no_browser()), reason=why_no_browser())]
+pytestmark = pytest.mark.skipif(bool(why_no_browser()), reason=why_no_browser())
 FRAMES, REACH, STEP_SIGMA = 60, 2, 0.003
 RIGHT, MISTAKEN = ((1, 54), (3, 56), (5, 58)), ((4, 31), (5, 32), (6, 33))
 """As in docs/which-edge.md, of half as many frames."""

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +11,15 @@ import pytest
 from typer.testing import CliRunner
 
 import hodge_pipeline
+from backbone_graphs import drive
 from hodge_adapters.pose_graphs.g2o import load_g2o, write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
-from hodge_pipeline.errors import CheckError, GraphError, HodgeError, RecipeError, SourceError
-from hodge_pipeline.refine.pose_graph import UNTOLD, SolveOptions, disabled_edges, solve_file
+from hodge_pipeline.errors import CheckError, GraphError, HodgeError, RecipeError, SourceError, WorkspaceError
+from hodge_pipeline.refine.pose_graph import UNTOLD, SolvedFile, SolveOptions, disabled_edges, read_graph, solve_file
+from hodge_pipeline.report.solved import write_run_folder
 from hodge_pipeline.sources.inspect import guess_reader
-from hodge_pipeline.types import ViewGraph
-from tests.backbone_graphs import drive
+from hodge_pipeline.types import Source, ViewGraph
 
 
 def graph_file(path: Path, planar: bool = False) -> ViewGraph:
@@ -99,6 +101,23 @@ def test_a_run_folder_is_left_and_solved_again(tmp_path):
     again = json.loads(hodge(tmp_path / "run", "--disable", "5-8", "--start", "given", "--json"))
     assert again["cost_before"] == pytest.approx(first["cost_after"], rel=1e-9)
     assert again["cost_after"] == pytest.approx(first["cost_after"], rel=1e-9)
+
+
+def test_a_graph_with_names_and_without_metres_is_left_as_such(tmp_path):
+    graph = graph_file(tmp_path / "in.g2o")
+    graph = dataclasses.replace(graph, vertex_ids=np.array([f"{row}.jpg" for row in range(8)]))
+    source = Source("model", tmp_path, graph=graph, in_metres=False)
+    solved = SolvedFile(source, graph, hodge_pipeline.solve(graph), SolveOptions(), 0.0, 0.0)
+    assert "not in this format, so lost: 8 names" in write_run_folder(tmp_path / "run", solved)
+    assert load_g2o(tmp_path / "run/graph.g2o").graph.vertex_ids.tolist() == list(range(8))
+    header, first, *_ = (tmp_path / "run/edges.csv").read_text().splitlines()
+    assert "residual_units" in header.split(",") and "residual_m" not in header.split(",") and ".jpg" in first
+    page = re.sub(r"<style.*?</style>|<[^>]*>", " ", (tmp_path / "run/report.html").read_text(), flags=re.DOTALL)
+    assert not re.search(r"\d (mm|cm|m)\b", page)
+    assert not read_graph(tmp_path / "run").in_metres
+    (tmp_path / "run/solved.json").write_text("[]")
+    with pytest.raises(WorkspaceError, match=r"solved\.json: is not what a solve writes"):
+        read_graph(tmp_path / "run")
 
 
 def test_the_certificate_is_told(tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse import bsr_matrix, csr_matrix
 
+from backbone_graphs import drive
 from hodge_pipeline import se3
 from hodge_pipeline.solvers import backends
 from hodge_pipeline.solvers import multigrid as multigrid_module
@@ -19,7 +20,6 @@ from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.multigrid import Coarsening, Modes, aggregates, multigrid
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 from solver_graphs import laplacian
-from tests.backbone_graphs import drive
 
 
 def tube(count: int, ring: int = 20, sigma: float = 0.05, planar: bool = False) -> ViewGraph:

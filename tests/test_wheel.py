@@ -65,7 +65,6 @@ def test_it_finds_its_recipes_and_stages(hodge: Path, tmp_path: Path) -> None:
     assert not [line for line in broken if "hodge-paper" not in line]  # its source is the checkout's, which is not seen
 
 
-@pytest.mark.slow
 def test_it_runs_the_demo(hodge: Path, tmp_path: Path) -> None:
     """A shorter one."""
     script = textwrap.dedent(f"""

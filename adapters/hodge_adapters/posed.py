@@ -57,7 +57,7 @@ def written(what: str, source: Source, keeps: Collection[str] = ()) -> tuple[str
     stamps = np.array([frame.stamp_s for frame in frames]) if frames else _stamps(source.trajectory)
     counts = {
         "stamps": 0 if np.array_equal(stamps, np.arange(len(stamps))) else len(stamps),
-        "names": sum(isinstance(frame.frame_id, str) for frame in frames),
+        "names": sum(isinstance(frame.frame_id, str) for frame in frames) or _named_vertices(source.graph),
         "cameras": len({frame.camera for frame in frames if frame.camera}),
         "images": sum(frame.read_colour is not None for frame in frames),
         "depth images": sum(frame.read_depth is not None for frame in frames),
@@ -77,6 +77,10 @@ def written(what: str, source: Source, keeps: Collection[str] = ()) -> tuple[str
 def left_out(no_numbers: int) -> tuple[str, ...]:
     """A line that says how many points the reader of the clouds left out, none where it kept all."""
     return (f"{counted(no_numbers, 'point that is|points that are')} not finite left out",) if no_numbers else ()
+
+
+def _named_vertices(graph: ViewGraph | None) -> int:
+    return graph.vertex_count if graph is not None and graph.vertex_ids.dtype.kind not in "iu" else 0
 
 
 def _stamps(trajectory: Trajectory | None) -> Floats:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from hodge_pipeline.cli.console import ProgressBars, print_json, print_table
 from hodge_pipeline.cli.options import Shown
 from hodge_pipeline.report.brief import LABEL, LINES, at_most, labelled, pointed
+from hodge_pipeline.store.workspace import EDGES_FILE
 from hodge_pipeline.types.text import counted, with_symbols
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ def _lines(found: Diagnosed, out: Path | None, top: int | None, bad: int) -> lis
         points += pointed(f"{name} {verdict}: {why}")
     left = found.subject.graph.edge_count - len(points)
     if left and (points or top is not None):
-        where = "--verbose" if out is None else str(out / "edges.csv")
+        where = "--verbose" if out is None else str(out / EDGES_FILE)
         points.append(f"  - … and {counted(left, 'more edge')}, none of them worse: {where}")
     return [*head, *points, *tail]
 

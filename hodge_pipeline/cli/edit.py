@@ -13,7 +13,6 @@ from hodge_pipeline.cli.options import Shown
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.pairs.edits import (
-    FILE,
     REGISTERED,
     Edit,
     History,
@@ -24,7 +23,7 @@ from hodge_pipeline.pairs.edits import (
     read_history,
     write_history,
 )
-from hodge_pipeline.store.workspace import holding
+from hodge_pipeline.store.workspace import EDITS_FILE, holding
 from hodge_pipeline.types import Edges
 from hodge_pipeline.types.edges import DISABLED, REJECTED
 from hodge_pipeline.types.text import command, with_symbols
@@ -50,11 +49,11 @@ def edit(folder: Path, pairs: Pairs, shown: Shown, *, undo: bool, listing: bool)
     listed = listed_edges(folder)
     changed = bool(undo or pairs)
     with holding(folder):
-        history = read_history(folder / FILE)
+        history = read_history(folder / EDITS_FILE)
         taken_back = history.edits[history.latest] if undo and history.latest is not None else None
         if changed:
             history = history.undo() if undo else history.added(_checked(folder, listed, pairs))
-            write_history(folder / FILE, history)
+            write_history(folder / EDITS_FILE, history)
     if shown.as_json:
         edits = [asdict(one) for one in history.edits]
         print_json({"run": str(folder), "switches": history.switches, "edits": edits})

@@ -10,7 +10,7 @@ from typing import Any, get_args
 from hodge_pipeline.cli.console import ProgressBars, print_table
 from hodge_pipeline.errors import RecipeError, WorkspaceError
 from hodge_pipeline.recipe.recording_options import Level
-from hodge_pipeline.store.workspace import is_run_folder
+from hodge_pipeline.store.workspace import RECORDING_FILE, is_run_folder
 from hodge_pipeline.types.input_files import beginning
 
 RRD_MAGIC = b"RR"
@@ -66,9 +66,9 @@ def _recording_of(path: Path) -> Path:
         raise WorkspaceError(f"{path}: no recording here, and no run folder: it does not exist")
     if path.is_file():
         if beginning(path, len(RRD_MAGIC)) != RRD_MAGIC:
-            raise WorkspaceError(f"{path}: no Rerun recording (.rrd): name a run folder, or its recording.rrd")
+            raise WorkspaceError(f"{path}: no Rerun recording (.rrd): name a run folder, or its {RECORDING_FILE}")
         return path
-    if not (recording := path / "recording.rrd").is_file():
+    if not (recording := path / RECORDING_FILE).is_file():
         if not is_run_folder(path):
             raise WorkspaceError(f"{path}: no run folder: name the folder that `hodge run … --out` wrote")
         raise WorkspaceError(f"{recording}: no recording here: make one with `hodge record {path} --level normal`")

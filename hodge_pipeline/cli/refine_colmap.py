@@ -13,6 +13,7 @@ from hodge_pipeline.cli.run import resumable
 from hodge_pipeline.errors import CheckError
 from hodge_pipeline.refine.model_options import RECIPE, load_model_refinement
 from hodge_pipeline.report.brief import COLUMNS, LABEL, labelled
+from hodge_pipeline.store.workspace import NUMBERS_FILE, PAGE_FILE
 from hodge_pipeline.types.text import counted
 
 if TYPE_CHECKING:
@@ -37,19 +38,20 @@ def refine(
     options = load_model_refinement(recipe or RECIPE, overrides)
     from hodge_pipeline.types.input_files import read_input_text
     from hodge_pipeline.uses.colmap import run_refinement
+    from hodge_pipeline.uses.model_folder import MODELS
 
     with resumable(out), ProgressBars.of(shown) as terminal:
         done = run_refinement(model, options, out=out, force=force, overwrite=overwrite, watcher=terminal, dask=dask)
     if shown.as_json:
-        print(read_input_text(out / "report.json"), end="")
+        print(read_input_text(out / NUMBERS_FILE), end="")
     elif not shown.quiet:
         for result in done.results:
             if shown.verbose:
                 _print_tables(result)
             print("\n".join(_lines(result, alone=len(done.results) == 1, verbose=shown.verbose)))
-        if (out / "sparse").is_dir():
-            print(f"{'model':<9}{out / 'sparse'}")
-        print(f"{'report':<9}{out / 'report.html'}")
+        if (out / MODELS).is_dir():
+            print(f"{'model':<9}{out / MODELS}")
+        print(f"{'report':<9}{out / PAGE_FILE}")
     failed = [result.decision.reason for result in done.results if result.decision.exit_code]
     if failed:
         written = any(result.decision.outcome == "worse" for result in done.results)

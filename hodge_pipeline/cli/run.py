@@ -16,6 +16,7 @@ from hodge_pipeline.cli.console import ProgressBars, print_json, print_table
 from hodge_pipeline.cli.options import Shown
 from hodge_pipeline.errors import CheckError, RecipeError, SourceError
 from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.store.workspace import RECORDING_FILE
 
 if TYPE_CHECKING:
     from hodge_pipeline.run_folder import Run
@@ -94,7 +95,7 @@ def resumable(out: Path) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as stop:
-        recording = out / "recording.rrd"
+        recording = out / RECORDING_FILE
         shown = f"; {recording} shows what was done" if recording.is_file() else ""
         print(f"stopped: the same command goes on where it stopped{shown}", file=sys.stderr)
         raise typer.Exit(143 if isinstance(stop, Terminated) else 130) from stop

@@ -10,14 +10,14 @@ from hodge_pipeline.cli.console import ProgressBars, print_json
 from hodge_pipeline.cli.convert import check_result, keep_source, writer_name
 from hodge_pipeline.cli.options import Shown
 from hodge_pipeline.errors import CheckError, RecipeError
-from hodge_pipeline.pairs.edits import FILE, read_history
+from hodge_pipeline.pairs.edits import read_history
 from hodge_pipeline.refine.pose_graph import SolvedFile, SolveOptions, solve_file, write_solved
 from hodge_pipeline.report.brief import LABEL, at_most, labelled
 from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName
 from hodge_pipeline.solvers.newton import TIME_LIMIT_REACHED
 from hodge_pipeline.solvers.setup import InitialName
-from hodge_pipeline.store.workspace import RECIPE_FILE
+from hodge_pipeline.store.workspace import EDITS_FILE, PAGE_FILE, RECIPE_FILE
 from hodge_pipeline.types import Source
 from hodge_pipeline.types.text import command, counted
 
@@ -78,7 +78,7 @@ def solve(
     if out is None and run_folder is None and options == SolveOptions() and (path / RECIPE_FILE).is_file():
         _solve_run(path, shown, dask)
         return
-    if path.is_dir() and (history := read_history(path / FILE)).edits:
+    if path.is_dir() and (history := read_history(path / EDITS_FILE)).edits:
         options = replace(options, disable=(*options.disable, *history.disabled))
         if out is None and not (path / RECIPE_FILE).is_file():
             run_folder = run_folder or path
@@ -87,15 +87,13 @@ def solve(
         keep_source(path, out)
     with ProgressBars.of(shown) as terminal, terminal.stage("solve", 1):
         solved = solve_file(path, options)
-    if out is not None:
-        write_solved(out, solved, _writer(out, solved.source))
-    left_out: tuple[str, ...] = ()
+    left_out = () if out is None else write_solved(out, solved, _writer(out, solved.source))
     if run_folder is not None:
         from hodge_pipeline.report.solved import write_run_folder
 
-        left_out = write_run_folder(run_folder, solved)
+        left_out += write_run_folder(run_folder, solved)
     summary = solved.summary()
-    summary["notes"] += left_out
+    summary["notes"] += dict.fromkeys(left_out)
     if shown.as_json:
         print_json({"source": str(solved.source.path), "out": None if out is None else str(out), **summary})
     elif not shown.quiet:
@@ -134,7 +132,7 @@ def _lines(
     time = f"{summary['wall_s']:.3f} s, {summary['cpu_s']:.3f} CPU s, {counted(summary['newton_steps'], 'step')}"
     lines.append(f"{'time':<{LABEL}}{time}")
     lines += [f"{'written':<{LABEL}}{out}"] if out is not None else []
-    lines += [f"{'report':<{LABEL}}{run_folder / 'report.html'}"] if run_folder is not None else []
+    lines += [f"{'report':<{LABEL}}{run_folder / PAGE_FILE}"] if run_folder is not None else []
     return [*lines, f"{'next':<{LABEL}}{command('hodge', 'diagnose', run_folder or solved.source.path)}"]
 
 

@@ -10,8 +10,7 @@ from scipy.sparse import csr_matrix
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, Ints, PointCloud
-
-AXIS_BITS = 21
+from hodge_pipeline.types.cell_keys import REACH, keys_of_cells
 
 
 def voxels(points_in_world: Floats, voxel_m: float, origin: Ints) -> Ints:
@@ -20,13 +19,13 @@ def voxels(points_in_world: Floats, voxel_m: float, origin: Ints) -> Ints:
     The lattice is fixed to the world's origin: voxel (a, b, c) is [a, a + 1) x … times `voxel_m`, whatever the
     `origin` (3,) in voxels that the keys count from. `GraphError` where points are a million voxels from it.
     """
-    cells = np.floor(points_in_world / voxel_m).astype(np.int64) - origin + (1 << (AXIS_BITS - 1))
-    if len(cells) and (cells.min() < 0 or cells.max() >= 1 << AXIS_BITS):
+    cells = np.floor(points_in_world / voxel_m).astype(np.int64) - origin
+    if len(cells) and (cells.min() < -REACH or cells.max() >= REACH):
         raise GraphError(
-            f"the clouds spread over more than {1 << AXIS_BITS} voxels of {voxel_m} m: the poses have diverged, "
+            f"the clouds spread over more than {2 * REACH} voxels of {voxel_m} m: the poses have diverged, "
             "or voxel_m is too small for this scene"
         )
-    return np.unique((cells[:, 0] << 2 * AXIS_BITS) | (cells[:, 1] << AXIS_BITS) | cells[:, 2])
+    return np.unique(keys_of_cells(cells))
 
 
 def voxel_occupancy(
@@ -37,7 +36,7 @@ def voxel_occupancy(
 
     The row of a frame without points, or with a pose that is not finite, is empty.
     """
-    finite = np.asarray(np.isfinite(world_from_cam).all(axis=(1, 2)))
+    finite = se3.has_pose(world_from_cam)
     origin = np.floor(world_from_cam[finite][:1, :3, 3].sum(axis=0) / voxel_m).astype(np.int64)
     nothing = np.zeros(0, np.int64)
     keys = [

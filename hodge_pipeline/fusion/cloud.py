@@ -15,16 +15,15 @@ from hodge_pipeline.fusion.views import Skipped, posed
 from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types import Bools, Bytes, Camera, Floats, Floats32, Frame, Ints, Model, PointCloud
 from hodge_pipeline.types.arrays import middles_in
+from hodge_pipeline.types.cell_keys import REACH, cells_of_keys, keys_of_cells
 from hodge_pipeline.types.text import counted
 
 POINTS_AT_ONCE = 1 << 20
+"""Of a frame, moved to the world: so a scan of any size takes some tens of megabytes."""
 
 MAX_STEP = 0.05
 """Share of the depth: a larger step between neighbouring pixels is an occlusion edge, which has no normal."""
 
-AXIS_BITS = 21
-"""Of a voxel's index along each axis: three of them are packed into one 64-bit key."""
-HALF = 1 << (AXIS_BITS - 1)
 MERGE_AT = 1_000_000
 """Rows collected between two merges: each sorts all voxels."""
 POSITION, COLOUR, NORMAL, COUNT = slice(0, 3), slice(3, 6), slice(6, 9), 9
@@ -160,14 +159,14 @@ class VoxelCloud:
         if self.origin is None:
             self.origin = np.floor(points_in_world.mean(axis=0))
         cells = np.floor((points_in_world - self.origin) / self.voxel_m)
-        near = (np.abs(cells) < HALF - 1).all(axis=1)
+        near = (np.abs(cells) < REACH - 1).all(axis=1)
         sums = np.zeros((len(cells), 10))
         sums[:, POSITION], sums[:, COUNT] = points_in_world - self.origin, 1
         if colours is not None:
             sums[:, COLOUR] = colours
         if normals_in_world is not None:
             sums[:, NORMAL] = normals_in_world
-        self._waiting.append(_reduced(_packed(cells[near].astype(np.int64)), sums[near]))
+        self._waiting.append(_reduced(keys_of_cells(cells[near].astype(np.int64)), sums[near]))
         if sum(len(keys) for keys, _ in self._waiting) > MERGE_AT:
             self._merge()
         return int((~near).sum())
@@ -191,17 +190,7 @@ class VoxelCloud:
         self._waiting = []
         while len(self._keys) > self.max_points:
             self.voxel_m *= 2
-            self._keys, self._sums = _reduced(_packed(_unpacked(self._keys) >> 1), self._sums)
-
-
-def _packed(cells: Ints) -> Ints:
-    shifted = cells + HALF
-    return np.asarray((shifted[:, 0] << 2 * AXIS_BITS) | (shifted[:, 1] << AXIS_BITS) | shifted[:, 2])
-
-
-def _unpacked(keys: Ints) -> Ints:
-    mask = (1 << AXIS_BITS) - 1
-    return np.stack([keys >> 2 * AXIS_BITS, (keys >> AXIS_BITS) & mask, keys & mask], axis=1) - HALF
+            self._keys, self._sums = _reduced(keys_of_cells(cells_of_keys(self._keys) >> 1), self._sums)
 
 
 def _reduced(keys: Ints, sums: Floats) -> tuple[Ints, Floats]:

@@ -14,14 +14,12 @@ from hodge_pipeline.complex.checks import check_motions
 from hodge_pipeline.errors import GraphError, WorkspaceError
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import read_edges
-from hodge_pipeline.store.workspace import REFINEMENT
+from hodge_pipeline.store.workspace import EDGES_FILE, REFINEMENT
 from hodge_pipeline.types import Bools, Edges, Floats, Ints
 from hodge_pipeline.types.arrays import Words
 from hodge_pipeline.types.edges import DISABLED, HELD_OUT
 from hodge_pipeline.types.text import command, number_of
 
-FILE = "edits.json"
-EDGES = "edges.csv"
 FORMAT_VERSION = 1
 ENABLED, RIGHT, REGISTERED = "enabled", "right", "registered"
 VERBS = ("disable", "enable", "right", "register")
@@ -176,20 +174,22 @@ class Listed:
         found = [[known[name] for a, b in _cuts(pair) if (name := f"{a}-{b}") in known] for pair in pairs]
         for pair, names in zip(pairs, found, strict=True):
             if not names:
-                raise GraphError(f"{pair}: no edge joins these frames: give two ids of {EDGES}, as 12-87")
+                raise GraphError(f"{pair}: no edge joins these frames: give two ids of {EDGES_FILE}, as 12-87")
         return tuple(dict.fromkeys(names[0] for names in found))
 
 
 def listed_edges(folder: Path) -> Listed:
     """Every edge and rejected pair of a run. Raises `WorkspaceError` where the folder holds no finished run."""
-    path = folder / EDGES
+    path = folder / EDGES_FILE
     if (folder / REFINEMENT).is_dir():
         raise WorkspaceError(
             f"{folder}: holds a refined model, of which no edge is switched: '{command('hodge', 'diagnose', folder)}' "
             "judges its edges, hodge refine colmap takes other options"
         )
     if not path.is_file():
-        raise WorkspaceError(f"{folder}: holds no finished run ({EDGES} is missing): run the recipe to its end first")
+        raise WorkspaceError(
+            f"{folder}: holds no finished run ({EDGES_FILE} is missing): run the recipe to its end first"
+        )
     edges, names = read_edges(path)
     return Listed(edges.select(edges.status != HELD_OUT), names)
 

@@ -44,7 +44,7 @@ class SourceOptions:
 class EvaluationOptions:
     """What is measured at the end."""
 
-    tables: bool = Field(default=True, description="the two score tables, about 40 CPU seconds for 250 frames")
+    tables: bool = Field(default=True, description="the two score tables, about 2 CPU seconds for 250 frames of a room")
     truth: Path | None = Field(
         default=None,
         description="a file of true poses of the frames; `frames`: the source's own poses are true; none: those of a "
@@ -70,9 +70,9 @@ class Recipe:
     source: SourceOptions = SourceOptions()
     scale: Annotated[float, Field(gt=0)] | Literal["auto"] = Field(
         default=1.0,
-        description="factor on every length (`…_m`) of clouds, start, edges, registration, acceptance, "
-        "solver and fusion, which are written for rooms; auto: such that most scans have 1500 to 40,000 voxels of "
-        "`clouds.voxel_m`, so 1 for rooms",
+        description="factor on every length (`…_m`) of clouds, start, edges, registration, complex, "
+        "acceptance, solver and fusion, which are written for rooms; auto: such that most scans have 1500 to 40,000 "
+        "voxels of `clouds.voxel_m`, so 1 for rooms",
     )
     clouds: CloudOptions = CloudOptions()
     start: Start = Field(

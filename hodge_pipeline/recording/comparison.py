@@ -16,8 +16,6 @@ from hodge_pipeline.recording.results import log_model
 from hodge_pipeline.recording.stream import Part, log_markdown, writing
 from hodge_pipeline.types import Floats, Model
 
-APART = "/plots/apart_m"
-
 
 def record_comparison(
     path: Path,
@@ -39,7 +37,7 @@ def record_comparison(
                 log_model(part, model, _model(side))
         if len(apart_m):
             times = [rr.TimeColumn(layout.FRAME, sequence=np.arange(len(apart_m)))]
-            stream.send_columns(APART, times, rr.Scalars.columns(scalars=apart_m))
+            stream.send_columns(layout.APART, times, rr.Scalars.columns(scalars=apart_m))
         log_markdown(stream, layout.SCORES, text)
 
 
@@ -52,7 +50,7 @@ def _blueprint(names: tuple[str, str], eye: Eye | None) -> rrb.Blueprint:
         return scene_view(name, [f"+ {entity}" for entity in contents], eye)
 
     a, b = layout.trajectory("a"), layout.trajectory("b")
-    plot = rrb.TimeSeriesView(origin=APART, name="Apart, m")
+    plot = rrb.TimeSeriesView(origin=layout.APART, name="Apart, m")
     text = rrb.TextDocumentView(origin=layout.SCORES, name="Numbers")
     tabs = rrb.Tabs(
         rrb.Horizontal(

@@ -12,8 +12,11 @@ from hodge_pipeline.types import Edges, Floats, ViewGraph
 from hodge_pipeline.types.text import markdown_table
 
 RADII = {CONSISTENT: -0.4, UNTESTABLE: -0.6, SUSPECT: -1.2, WRONG: -1.6}
+"""Of the lines, in points of the screen (negative in Rerun): the worse the thicker."""
 BYTES_EACH = 160
+"""Of a recorded edge with its label."""
 LISTED = 40
+"""Edges in the table, the least likely first."""
 
 
 def log_diagnosis(part: Part, graph: ViewGraph, world_from_cam: Floats, edges: Edges) -> None:

@@ -16,6 +16,7 @@ ELEVATION = 0.6
 DISTANCE = 0.8
 """In units of the scene's size, along the mean view and above it."""
 MAX_POINTS = 20_000
+"""Points by which the size of a scene is measured, spread over all: its quantiles need no more."""
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,10 @@ from hodge_pipeline.recording.merge import contents_of, eyes, readers_of, send, 
 from hodge_pipeline.recording.stream import log_markdown, open_stream
 
 HOST = "127.0.0.1"
-PORT = 9876
-WEB_PORT = 9090
+PORT, WEB_PORT = 9876, 9090
+"""Those of Rerun, for data and for the page."""
 START_S = 60.0
+"""That a viewer may take until it listens."""
 
 
 class Live:

@@ -9,15 +9,15 @@ import rerun.notebook
 from rerun.error_utils import RerunMissingDependencyError
 
 from hodge_pipeline.errors import WorkspaceError
-from hodge_pipeline.recording.run import FILE
 from hodge_pipeline.recording.stream import APPLICATION
+from hodge_pipeline.store.workspace import RECORDING_FILE
 
 
 def viewer(folder: Path, width: int, height: int) -> Any:
     """A `rerun.notebook.Viewer` of a run's recording, in pixels. Raises `WorkspaceError` where there is none, or no
     rerun-notebook.
     """
-    recording = folder / FILE
+    recording = folder / RECORDING_FILE
     if not recording.is_file():
         raise WorkspaceError(f"{recording}: no recording here: make one with `hodge record RUN --level normal`")
     stream = rerun.RecordingStream(APPLICATION)

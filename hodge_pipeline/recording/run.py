@@ -24,15 +24,13 @@ from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.log import log
 from hodge_pipeline.store.progress import RECORDING
 from hodge_pipeline.store.store import stored
-from hodge_pipeline.store.workspace import RECIPE_FILE, RUN, identity_of
+from hodge_pipeline.store.workspace import LOG_FILE, RECIPE_FILE, RECORDING_FILE, RUN, identity_of
 from hodge_pipeline.types import CloudSet, Floats, Ints, Source
 from hodge_pipeline.types.axes import is_scanner
 from hodge_pipeline.types.input_files import read_input_text
 from hodge_pipeline.types.notes import notes_of
 from hodge_pipeline.types.ply import read_model
 from hodge_pipeline.types.text import markdown_table
-
-FILE = "recording.rrd"
 
 
 class Recording:
@@ -138,7 +136,7 @@ class Recording:
         merged = self._steps.step(
             merge_recording, self._parts, self._recipe.recording, title=RECORDING, merge=self._merge
         )
-        artifacts.link_or_copy(merged, self._folder / FILE)
+        artifacts.link_or_copy(merged, self._folder / RECORDING_FILE)
 
     def _rescue(self) -> None:
         """Merge the parts so far; an error is only logged, so that the one that stopped the run is raised."""
@@ -148,7 +146,7 @@ class Recording:
                 made = [found for found in stored(self._folder / RUN, clouds_step) if len(found) == whole]
                 self._record_frames(self._source, made[-1] if made else None)
             with tempfile.TemporaryDirectory(dir=self._folder, prefix=".recording-") as scratch:
-                self._merge(Path(scratch), self._folder / FILE)
+                self._merge(Path(scratch), self._folder / RECORDING_FILE)
         except Exception as error:
             log.warning("the recording could not be merged: %s", error)
 
@@ -156,7 +154,7 @@ class Recording:
         """Write all parts into `out`, with true and given poses, recipe and log; the notes of these."""
         recorder = self._recorder(folder)
         notes = _record_reference(recorder, self._source, self._rounds)
-        lines = read_input_text(self._folder / "log.txt", errors="replace").splitlines()
+        lines = read_input_text(self._folder / LOG_FILE, errors="replace").splitlines()
         recorder.text(read_input_text(self._folder / RECIPE_FILE, errors="replace"), lines)
         parts = [*self._parts, *find_parts(folder)]
         if self._live is not None:
@@ -182,8 +180,8 @@ def merge_recording(
     parts: list[Path], options: RecordingOptions, *, merge: Callable[[Path, Path], Notes], step: Step
 ) -> Path:
     """Step: all parts as one file."""
-    step.note(*notes_of("recording", merge(step.folder, step.folder / FILE)))
-    return step.folder / FILE
+    step.note(*notes_of("recording", merge(step.folder, step.folder / RECORDING_FILE)))
+    return step.folder / RECORDING_FILE
 
 
 def _record_reference(recorder: Recorder, source: Source, rounds: Sequence[Round]) -> Notes:

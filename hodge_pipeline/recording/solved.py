@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hodge_pipeline.recording.recorder import Recorder
-from hodge_pipeline.recording.run import FILE
 from hodge_pipeline.recording.stream import identity_of_poses
+from hodge_pipeline.store.workspace import RECORDING_FILE
 from hodge_pipeline.types import Floats, Solution, ViewGraph
 
 
@@ -34,5 +34,5 @@ def record_graph(
         left_out += [note for label, poses in sets.items() for note in recorder.poses(label, poses)]
         if graph is not None and solution is not None:
             left_out += [*recorder.edges(1, graph, start), *recorder.solution(1, graph, start, solution)]
-        recorder.finish(folder / FILE)
+        recorder.finish(folder / RECORDING_FILE)
     return tuple(left_out)

@@ -16,7 +16,7 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.conventions import inverted_notes
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import solve_robust
-from hodge_pipeline.errors import GraphError, SourceError
+from hodge_pipeline.errors import GraphError, SourceError, WorkspaceError
 from hodge_pipeline.pairs.edits import joining
 from hodge_pipeline.recipe.recipe_file import recipe_names
 from hodge_pipeline.solvers.backbone.credible import credible_steps
@@ -26,10 +26,11 @@ from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.setup import InitialName
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.sources.unknown import without_frames
+from hodge_pipeline.store import artifacts
+from hodge_pipeline.store.workspace import GRAPH_FILE, SOLVED_FILE
 from hodge_pipeline.types import Bools, Floats, Solution, Source, Trajectory, ViewGraph
 from hodge_pipeline.types.text import command, counted
 
-RUN_GRAPH = "graph.g2o"
 ROUNDING = 1e-15
 """Share of the first cost that rounding leaves of one that vanishes."""
 GRAPH_WRITERS = ("g2o", "open3d_pose_graph")
@@ -118,6 +119,7 @@ class SolvedFile:
             "edges": graph.edge_count,
             "edges_ignored": int((self.solution.weights <= 0).sum()),
             "dimension": graph.dimension,
+            "in_metres": self.source.in_metres,
             "pieces": int(self.solution.component.max(initial=-1)) + 1,
             "objective": "full" if "chi2" in metrics else "isotropic",
             "cost_before": metrics.get("objective_at_start"),
@@ -138,9 +140,10 @@ class SolvedFile:
 def read_graph(path: Path) -> Source:
     """A source with the graph at a path, of any registered format or a run folder; a note where motions look inverted.
 
-    Raises `SourceError` where there is no graph.
+    Raises `SourceError` where there is no graph, `WorkspaceError` where the folder of a solve is damaged.
     """
-    path = path / RUN_GRAPH if (path / RUN_GRAPH).is_file() else path
+    in_metres = not (path / SOLVED_FILE).is_file() or _in_metres(path / SOLVED_FILE)
+    path = path / GRAPH_FILE if (path / GRAPH_FILE).is_file() else path
     reader = guess_reader(path)
     source = reader.open(path)
     if source.graph is None:
@@ -148,7 +151,16 @@ def read_graph(path: Path) -> Source:
         run = command("hodge", "run", recipe, "--source", path, "--out", "RUN")
         rest = f"; its frames give one: {run}, then give RUN" if source.frames else f" but {without_frames(source)}"
         raise SourceError(f"{path}: holds no graph of measured edges{rest}")
-    return replace(source, notes=(*inverted_notes(source.graph), *source.notes))
+    notes = (*inverted_notes(source.graph), *source.notes)
+    return replace(source, notes=notes, in_metres=source.in_metres and in_metres)
+
+
+def _in_metres(solved: Path) -> bool:
+    """Whether the numbers of a solve say that lengths are in metres, which a graph's file cannot say."""
+    try:
+        return bool(artifacts.read_json(solved).get("in_metres", True))
+    except (OSError, ValueError, AttributeError) as error:
+        raise WorkspaceError(f"{solved}: is not what a solve writes ({error}): solve the graph again") from error
 
 
 def disabled_edges(graph: ViewGraph, pairs: Sequence[str]) -> Bools:
@@ -211,16 +223,18 @@ def _solved(graph: ViewGraph, start: Floats | None, options: SolveOptions) -> So
     )
 
 
-def write_solved(path: Path, solved: SolvedFile, writer: str = "g2o") -> None:
+def write_solved(path: Path, solved: SolvedFile, writer: str = "g2o") -> tuple[str, ...]:
     """Write the solved poses; a writer of graphs also gets every edge as measured, ignored ones too, in the order read.
 
-    A writer of poses gets them in the order of the vertices' numbers.
+    A writer of poses gets them in the order of the vertices' numbers. Gives what the format lost, a line each.
     """
     poses, graph = solved.solution.world_from_cam, solved.graph
     trajectory = Trajectory(np.arange(len(poses), dtype=float), poses)
     if writer not in GRAPH_WRITERS:
         trajectory = vertex_trajectory(graph, poses)
-    registry.load("writers", writer)().write(path, replace(solved.source, trajectory=trajectory))
+    graph_alone = replace(solved.source, frames=(), trajectory=trajectory)
+    told: tuple[str, ...] = registry.load("writers", writer)().write(path, graph_alone)
+    return told[1:]
 
 
 def vertex_trajectory(graph: ViewGraph, world_from_vertex: Floats) -> Trajectory:

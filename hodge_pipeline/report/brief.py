@@ -9,6 +9,7 @@ from hodge_pipeline.report.contents import Report
 from hodge_pipeline.report.suspicions import suspicions
 from hodge_pipeline.report.verdict import judge
 from hodge_pipeline.report.words import duration, next_commands, peak, worst_places
+from hodge_pipeline.store.workspace import PAGE_FILE
 from hodge_pipeline.types.notes import Rank
 from hodge_pipeline.types.text import with_symbols
 
@@ -43,7 +44,7 @@ def _end(report: Report, folder: str) -> Iterator[str]:
         wall, cpu = (sum(getattr(stage, name) for stage in report.stages) for name in ("wall_s", "cpu_s"))
         stages = " in the stages" if len(report.stages) > 1 else ""
         yield from labelled("time", f"{duration(wall)}, {cpu:.1f} CPU s{stages}{peak(report)}")
-    yield f"{'report':<{LABEL}}{folder}/report.html"
+    yield f"{'report':<{LABEL}}{folder}/{PAGE_FILE}"
     command = next(line for line in next_commands(report, folder) if not line.startswith("#"))
     yield f"{'next':<{LABEL}}{command}"
 

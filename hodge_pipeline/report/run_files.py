@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from hodge_pipeline.scene import Round, Scene, sequences_of
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.store import Store
+from hodge_pipeline.store.workspace import EDGES_FILE, GRAPH_FILE
 from hodge_pipeline.types import Floats, Source, Trajectory
 from hodge_pipeline.types.text import cell, csv_text, file_stems
 
@@ -49,13 +49,10 @@ def write_pose_table(folder: Path, source: Source, world_from_cam: Floats) -> No
 
 def write_graph(folder: Path, source: Source, last: Round) -> None:
     """`graph.g2o` (vertices by frame number, or by row where frames have names) and `edges.csv`."""
-    graph = last.graph
-    ids = graph.vertex_ids if graph.vertex_ids.dtype.kind == "i" else np.arange(graph.vertex_count)
-    numbered = dataclasses.replace(graph, vertex_ids=ids)
-    trajectory = Trajectory(np.arange(graph.vertex_count, dtype=float), last.world_from_cam)
-    whole = Source(source.name, source.path, trajectory=trajectory, graph=numbered)
-    registry.load("writers", "g2o")().write(folder / "graph.g2o", whole)
-    write_edges(folder / "edges.csv", last.edges, last.vertex_ids)
+    trajectory = Trajectory(np.arange(last.graph.vertex_count, dtype=float), last.world_from_cam)
+    whole = Source(source.name, source.path, trajectory=trajectory, graph=last.graph)
+    registry.load("writers", "g2o")().write(folder / GRAPH_FILE, whole)
+    write_edges(folder / EDGES_FILE, last.edges, last.vertex_ids)
 
 
 def write(

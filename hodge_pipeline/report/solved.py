@@ -9,7 +9,7 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.evaluation.residuals import with_residuals
 from hodge_pipeline.recording.solved import record_graph
-from hodge_pipeline.refine.pose_graph import RUN_GRAPH, SolvedFile, write_solved
+from hodge_pipeline.refine.pose_graph import SolvedFile, write_solved
 from hodge_pipeline.report.contents import Pictures, RefinementSummary, Report, SourceSummary, StageRow
 from hodge_pipeline.report.diagnosis_page import LISTED
 from hodge_pipeline.report.summary import graph_summary, worst_edges
@@ -17,24 +17,25 @@ from hodge_pipeline.report.write import write_report
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import write_edges
 from hodge_pipeline.store.store import versions
-from hodge_pipeline.store.workspace import SOLVED, make_folder
+from hodge_pipeline.store.workspace import EDGES_FILE, GRAPH_FILE, SOLVED_FILE, make_folder
 from hodge_pipeline.types import Edges, Floats
 from hodge_pipeline.types.notes import notes_of
 from hodge_pipeline.types.text import counted
 
 
 def write_run_folder(folder: Path, solved: SolvedFile) -> tuple[str, ...]:
-    """Write the folder, made if it is not there; what the recording left out, in words."""
+    """Write the folder, made if it is not there; what the graph's file and the recording left out, in words."""
     make_folder(folder, "--run")
-    write_solved(folder / RUN_GRAPH, solved)
-    edges = _edges(solved)
-    write_edges(folder / "edges.csv", edges, solved.graph.vertex_ids)
-    artifacts.write_json(folder / SOLVED, solved.summary())
+    lost, edges = write_solved(folder / GRAPH_FILE, solved), _edges(solved)
+    write_edges(folder / EDGES_FILE, edges, solved.graph.vertex_ids, has_metres=solved.source.in_metres)
+    artifacts.write_json(folder / SOLVED_FILE, solved.summary())
     write_report(folder, _report(solved, edges))
     source, solution = solved.source, solved.solution
     start = solution.world_from_cam if solved.start is None else solved.start
     sets, is_scanner = _before(solved), not source.of_cameras
-    return record_graph(folder, source.name, solved.graph, start, solution, sets, source.notes, is_scanner=is_scanner)
+    return lost + record_graph(
+        folder, source.name, solved.graph, start, solution, sets, source.notes, is_scanner=is_scanner
+    )
 
 
 def _edges(solved: SolvedFile) -> Edges:
@@ -80,4 +81,5 @@ def _report(solved: SolvedFile, edges: Edges) -> Report:
             Pictures.of_graph(sets, graph, solution.component),
             convergence={"solve": tuple(step.objective for step in solution.history)},
         ),
+        has_metres=source.in_metres,
     )

@@ -15,6 +15,7 @@ from hodge_pipeline.report.run_page import document
 from hodge_pipeline.report.suspicions import suspicions
 from hodge_pipeline.report.verdict import judge
 from hodge_pipeline.store.artifacts import write_json, write_text
+from hodge_pipeline.store.workspace import NUMBERS_FILE, PAGE_FILE
 
 FORMAT_VERSION = 3
 """Raised when a key of `report.json` is renamed, moved or removed."""
@@ -22,7 +23,7 @@ FORMAT_VERSION = 3
 
 def write_report(folder: Path, report: Report) -> tuple[Path, Path]:
     """Write `report.html` and `report.json` into a folder that exists, and give back their paths."""
-    page, numbers = folder / "report.html", folder / "report.json"
+    page, numbers = folder / PAGE_FILE, folder / NUMBERS_FILE
     write_text(page, render(document(report, str(folder))))
     write_json(numbers, as_json(report))
     return page, numbers

@@ -9,10 +9,11 @@ import numpy as np
 
 from hodge_pipeline import registry
 from hodge_pipeline.errors import not_written
-from hodge_pipeline.pairs.edits import FILE, write_history
+from hodge_pipeline.pairs.edits import write_history
 from hodge_pipeline.refine.reprojection_cost import SAME_COST, costs
 from hodge_pipeline.review.session import Session
 from hodge_pipeline.review.subject import SIDE_FILE, Subject
+from hodge_pipeline.store.workspace import EDITS_FILE
 from hodge_pipeline.types import Floats, Trajectory, ViewGraph
 from hodge_pipeline.types.text import counted
 from hodge_pipeline.types.tracked_model import TrackedModel
@@ -35,7 +36,7 @@ def save(session: Session) -> tuple[Path, str]:
     try:
         if subject.model is not None:
             told = _write_model(path, subject.model, settled.world_from_cam)
-            write_history(path / FILE, history)
+            write_history(path / EDITS_FILE, history)
         else:
             chosen = table.graph.select(np.flatnonzero(settled.weights > 0))
             told = _write_graph(path, subject, chosen, settled.world_from_cam)

@@ -33,8 +33,6 @@ FILES = {
     "page.js": ("page.js", "text/javascript; charset=utf-8"),
     "page.css": ("page.css", "text/css; charset=utf-8"),
 }
-SUGGESTED = 12
-"""Pairs that are suggested."""
 QUERY = TypeAdapter(Query)
 Asked = dict[str, Any]
 """The parameters of a request, not checked yet."""
@@ -166,7 +164,7 @@ def suggestions(session: Session) -> list[dict[str, Any]]:
     if judged is None:
         return []
     graph = table.graph.select(judged.rows)
-    found = suggest_pairs(graph, judged.diagnosis, SUGGESTED, tried=table.graph.edges)
+    found = suggest_pairs(graph, judged.diagnosis, tried=table.graph.edges)
     names = pair_names(graph.vertex_ids, found.pairs)
     rows = zip(names, found.pairs.tolist(), found.score.tolist(), found.reason.tolist(), strict=True)
     return [{"pair": name, "frames": pair, "gain": round(score, 3), "reason": why} for name, pair, score, why in rows]

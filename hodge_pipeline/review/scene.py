@@ -104,7 +104,7 @@ class Scene:
 
         The view is from behind and above: 1.8 sizes up and 1.3 back show the scene in viser's field of view.
         """
-        known = poses[np.isfinite(poses).all(axis=(1, 2))]
+        known = poses[se3.has_pose(poses)]
         _, radius = ball(known[:, :3, 3])
         self._size = max(radius, 0.5) if self._subject.unit == "m" else radius
         clouds = self._subject.clouds
@@ -168,7 +168,7 @@ class Scene:
         """Draw axes at the poses, 4 % of the scene's size long, shorter where there are many."""
         if self._same("/cameras", poses):
             return
-        known = poses[np.isfinite(poses).all(axis=(1, 2))]
+        known = poses[se3.has_pose(poses)]
         length = 0.04 * self._size / max(1.0, (len(known) / CROWD) ** 0.5)
         self._server.scene.add_batched_axes(
             "/cameras", quat_wxyz(known), known[:, :3, 3], axes_length=length,

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.pairs.edits import FILE
 from hodge_pipeline.recipe.schema import Recipe
 from hodge_pipeline.refine.candidates import NO_EDGE
 from hodge_pipeline.refine.model import refinable
@@ -21,7 +20,7 @@ from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import true_poses
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.sources.inspect import guesses
-from hodge_pipeline.store.workspace import is_run_folder
+from hodge_pipeline.store.workspace import EDITS_FILE, is_run_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Solution, Source, ViewGraph
 from hodge_pipeline.types.axes import is_scanner
 from hodge_pipeline.types.edges import DISABLED, REJECTED, USED
@@ -113,7 +112,7 @@ def _of_run(path: Path) -> Subject:
         edges=edges,
         graph=edges.as_graph(last.vertex_ids),
         solution=_with_all_weights(last.solution, last.world_from_cam, edges),
-        edits=path / FILE,
+        edits=path / EDITS_FILE,
         log=path / LOG,
         truth=true_poses(run.source)[run.key_frames.rows],
         source=run.source,
@@ -181,7 +180,7 @@ def _beside(path: Path, source: Source, edges: Edges, graph: ViewGraph, solution
         edges=edges,
         graph=graph,
         solution=solution,
-        edits=path / FILE if is_folder else path.with_name(path.name + SIDE_FILE),
+        edits=path / EDITS_FILE if is_folder else path.with_name(path.name + SIDE_FILE),
         log=path / LOG if is_folder else path.with_name(path.name + SIDE_LOG),
         truth=np.full((graph.vertex_count, 4, 4), np.nan),
         source=source,

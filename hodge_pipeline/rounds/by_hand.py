@@ -12,11 +12,12 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.evaluation.residuals import edge_residuals
-from hodge_pipeline.pairs.edits import ENABLED, FILE, REGISTERED, RIGHT, History, joining, read_history, vertex_rows
+from hodge_pipeline.pairs.edits import ENABLED, REGISTERED, RIGHT, History, joining, read_history, vertex_rows
 from hodge_pipeline.rounds.more import Placed, register_more
 from hodge_pipeline.rounds.one_round import EDITED, Registered, Work
 from hodge_pipeline.scene import Round
 from hodge_pipeline.start.unordered.pieces import laid_apart
+from hodge_pipeline.store.workspace import EDITS_FILE
 from hodge_pipeline.types import Edges, Floats, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, HELD_OUT, REJECTED, USED
 from hodge_pipeline.types.notes import Note
@@ -32,7 +33,7 @@ def edited_rounds(work: Work, folder: Path, rounds: Sequence[Round]) -> Iterator
     It begins at the poses of the earlier round that its edges agree with best, since those after a wrong edge may be
     far off, and is solved by the recipe's solver.
     """
-    last, history = rounds[-1], read_history(folder / FILE)
+    last, history = rounds[-1], read_history(folder / EDITS_FILE)
     if not history.switches:
         return
     ids, registered, before = last.vertex_ids, last.registered(work.measured), last.world_from_cam

@@ -25,9 +25,9 @@ from hodge_pipeline.solvers.editing import GraphEditor
 from hodge_pipeline.solvers.positions import Fixes, Placed, place
 from hodge_pipeline.sources.measured_edges import without_measured
 from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Step, Steps, Workers
-from hodge_pipeline.start.known_positions import up_of
 from hodge_pipeline.start.unordered.tour import propose_along_tour
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Solution, Source, ViewGraph
+from hodge_pipeline.types.axes import is_scanner, up_and_ahead
 from hodge_pipeline.types.edges import HELD_OUT
 from hodge_pipeline.types.notes import Note, notes_of
 
@@ -87,7 +87,7 @@ class Work:
         first = scene.first if closed is None else replace(scene.first, world_from_cam=closed.world_from_cam)
         if self.fixes is None or scene.is_given:
             return first
-        up = up_of(scene, first.world_from_cam)
+        up = self._up(first.world_from_cam)
         found = self.steps.step(place_first, first, self.fixes, up, title="known positions")
         return replace(first, world_from_cam=found)
 
@@ -124,6 +124,10 @@ class Work:
             self.steps.note(Note("slid", len(slid), in_runs(slid, self.scene.first.vertex_ids)))
         return found if self.scene.drift is None else with_odometry(found, self.scene.first.edges)
 
+    def _up(self, world_from_cam: Floats) -> Floats:
+        """The mean up direction (3,) in the world of the poses."""
+        return up_and_ahead(world_from_cam, is_scanner(self.scene.clouds))[0]
+
     @property
     def scale(self) -> float:
         """Factor on lengths that are written for rooms."""
@@ -143,7 +147,7 @@ class Work:
     def solve(self, judged: Registered, found: Energies | None) -> Round:
         """The round of these edges, and the poses consistent with those that the recipe solves with."""
         recipe, ids = self.recipe, self.scene.first.vertex_ids
-        up = None if self.fixes is None else up_of(self.scene, judged.start)
+        up = None if self.fixes is None else self._up(judged.start)
         return self.steps.step(
             solve_edges, judged, ids, recipe.solver, recipe.solve_with, found, self.fixes, up, title=judged.title
         )

@@ -14,6 +14,8 @@ from hodge_pipeline.solvers.resistance import Network
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 from hodge_pipeline.types.text import counted
 
+SUGGESTED = 12
+"""Pairs that are suggested to a person, at most."""
 NEAREST = 6
 """Nearest views of each view that are candidates, whatever edges there are."""
 TESTED_GAIN = 1.0
@@ -47,7 +49,7 @@ class Suggestions:
 def suggest_pairs(
     graph: ViewGraph,
     diagnosis: Diagnosis,
-    most: int = 20,
+    most: int = SUGGESTED,
     *,
     overlapping: Ints | None = None,
     tried: Ints | None = None,

@@ -15,8 +15,8 @@ from hodge_pipeline.types.input_files import open_input
 LOOKED_AT = 60
 """Paths inside a folder that the readers sniff at, at most: some hundredths of a second."""
 IMAGES, AS_PNG = "images are read as PNG or JPEG", "to PNG, depth with all 16 bits"
-DEPTH = 3
-NAMED = 3
+DEPTH, NAMED = 3, 3
+"""Levels of folders that are looked through for something readable, and how many finds are told."""
 UNREAD_IMAGES = (".pgm", ".ppm", ".tif", ".tiff", ".bmp", ".exr", ".webp")
 READ_IMAGES = (".png", ".jpg", ".jpeg")
 UNKNOWN_LAYOUT = (

@@ -96,13 +96,6 @@ def fixes_of(positions: Positions, options: PositionOptions, scene: Scene, steps
     return Fixes(key, arms, positions.points[found], covariances, stated, labels, positions.origin)
 
 
-def up_of(scene: Scene, world_from_cam: Floats) -> Floats:
-    """The mean up direction (3,) in the world of the poses: a scanner's z axis, or a camera's y axis reversed."""
-    is_camera = scene.source.frames[0].camera is not None
-    up = (-world_from_cam[:, :3, 1] if is_camera else world_from_cam[:, :3, 2]).mean(axis=0)
-    return np.asarray(up / max(float(np.linalg.norm(up)), 1e-9))
-
-
 def _rows_by_name(names: Words, frames: Sequence[Frame]) -> Ints:
     """The row of the frame that each name means, -1 for none: by its id, its file's name, or its number."""
     rows: dict[str, int] = {}
@@ -138,7 +131,7 @@ def _at_stamps(stamps_s: Floats, source: Source, keys: KeyFrames, max_gap_s: flo
         if not len(rows) or (np.diff(own) <= 0).any():
             continue
         at = se3.poses_at(Trajectory(own, keys.first[rows]), stamps_s, gap_s)
-        known = np.isfinite(at).all(axis=(1, 2)) & (frame < 0)
+        known = se3.has_pose(at) & (frame < 0)
         poses[known] = at[known]
         frame[known] = rows[np.abs(own[:, None] - stamps_s[known]).argmin(axis=0)]
     return frame, poses

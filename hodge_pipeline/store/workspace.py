@@ -18,12 +18,13 @@ from hodge_pipeline.store import artifacts, yaml_file
 from hodge_pipeline.types.input_files import read_input
 from hodge_pipeline.types.text import command
 
-RECIPE_FILE, LOCK_FILE = "recipe.yaml", ".lock"
+RECIPE_FILE, EDITS_FILE, LOG_FILE, LOCK_FILE = "recipe.yaml", "edits.json", "log.txt", ".lock"
+EDGES_FILE, GRAPH_FILE, SOLVED_FILE = "edges.csv", "graph.g2o", "solved.json"
+PAGE_FILE, NUMBERS_FILE, RECORDING_FILE = "report.html", "report.json", "recording.rrd"
+"""Files of a run folder; `SOLVED_FILE` is in that of a solved pose-graph file alone."""
 _DRAFT = re.compile(r"\.[^.].*\.(csv|g2o|html|json|kitti|npz|ply|rrd|tum|txt|yaml)\.[0-9]+\.draft")
 _DRAFT_FOLDER = re.compile(r"\.(recording-|sparse\.)[a-z0-9_]{8}")
 """Names of unfinished files and folders of `output_files` and of the recording."""
-SOLVED = "solved.json"
-"""In the run folder of a solved pose-graph file."""
 RUN, REFINEMENT = "stages", "refinement"
 """The folder of the stages of a run, and of the refinement of a model."""
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, None)

@@ -12,7 +12,7 @@ import numpy as np
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import WRONG, Diagnosis
-from hodge_pipeline.pairs.edits import EDGES, FILE, joining, pair_names, read_history
+from hodge_pipeline.pairs.edits import joining, pair_names, read_history
 from hodge_pipeline.recipe.round_options import SuggestionOptions
 from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.report.advice import advice, in_unit, ranked
@@ -22,7 +22,7 @@ from hodge_pipeline.report.suspicions import NOTHING_MOVED_M
 from hodge_pipeline.rounds.suggestions import Suggestions, suggest_pairs
 from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.store.edge_table import read_edges
-from hodge_pipeline.store.workspace import SOLVED, is_run_folder
+from hodge_pipeline.store.workspace import EDGES_FILE, EDITS_FILE, SOLVED_FILE, is_run_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Frame, Ints, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, IGNORED, USED
 from hodge_pipeline.types.text import command
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from hodge_pipeline.report.contents import Report
     from hodge_pipeline.run_folder import Run
 
-SUGGESTED, COMMANDED_PAIRS = 12, 6
-"""Pairs that are suggested, and those at most that a command to type registers."""
+COMMANDED_PAIRS = 6
+"""Suggested pairs at most that a command to type registers."""
 COMMANDED_EDGES = 3
 """Edges at most that a command to type disables: more are left to `--robust`."""
 
@@ -94,7 +94,7 @@ def _file_subject(path: Path) -> DiagnosisSubject:
     assert source.graph is not None
     name = path.stem if path.is_file() else path.name
     edges = Edges.measured(source.graph)
-    if (path / SOLVED).is_file() and len(solved := read_edges(path / EDGES)[0]) == len(edges):
+    if (path / SOLVED_FILE).is_file() and len(solved := read_edges(path / EDGES_FILE)[0]) == len(edges):
         edges = edges.put(solved.status == IGNORED, status=IGNORED)
     return DiagnosisSubject(
         path, name, source.graph, _edited(path, source.graph, edges), notes=source.notes, has_metres=source.in_metres
@@ -134,7 +134,7 @@ def _harmless(report: Report) -> str:
 
 def _edited(path: Path, graph: ViewGraph, edges: Edges) -> Edges:
     """The edges with those disabled that the present edits in the folder disable, and no others."""
-    disabled = read_history(path / FILE).disabled if path.is_dir() else ()
+    disabled = read_history(path / EDITS_FILE).disabled if path.is_dir() else ()
     edges = edges.put(edges.status == DISABLED, status=USED)
     return edges.put(joining(graph.vertex_ids, graph.edges, *disabled), status=DISABLED)
 
@@ -180,9 +180,7 @@ def diagnose_subject(subject: DiagnosisSubject) -> Diagnosed:
         *_side_by_side(subject, found),
         *complaints,
     )
-    suggestions = suggest_pairs(
-        subject.graph, found, SUGGESTED, overlapping=_overlapping(subject, found), tried=subject.tried
-    )
+    suggestions = suggest_pairs(subject.graph, found, overlapping=_overlapping(subject, found), tried=subject.tried)
     commands = _commands(subject, found, suggestions)
     told = advice(found, subject.disabled, subject.left_out | bool(harmless))
     return Diagnosed(subject, found, told, energy, commands, notes, suggestions)

@@ -17,7 +17,7 @@ from hodge_pipeline.report.document import render
 from hodge_pipeline.report.edge_pictures import edge_pictures
 from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import write_edges
-from hodge_pipeline.store.workspace import make_folder
+from hodge_pipeline.store.workspace import EDGES_FILE, make_folder
 from hodge_pipeline.types import Source
 from hodge_pipeline.uses.diagnosed import Diagnosed, DiagnosisSubject
 
@@ -31,7 +31,7 @@ def write_diagnosed(out: Path, diagnosed: Diagnosed) -> None:
     subject, found = diagnosed.subject, diagnosed.diagnosis
     residuals = {"residual_m": found.residual_m, "residual_rad": np.deg2rad(found.residual_deg)}
     edges, names = replace(found.put_into(subject.edges), **residuals), subject.graph.vertex_ids
-    write_edges(out / "edges.csv", edges, names, has_metres=subject.has_metres)
+    write_edges(out / EDGES_FILE, edges, names, has_metres=subject.has_metres)
     _write_poses(out / "poses.tum", subject, found)
     artifacts.write_text(out / "diagnosis.html", render(document(_page(diagnosed))))
     write_diagnosis(out / "diagnosis.rrd", subject.graph, pieces_apart(found.world_from_cam, found.piece), found)

@@ -23,7 +23,7 @@ from hodge_pipeline.start.truth import with_truth
 from hodge_pipeline.store.log import logging_to
 from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.store.store import Store
-from hodge_pipeline.store.workspace import RECIPE_FILE, Workspace, disk_errors
+from hodge_pipeline.store.workspace import LOG_FILE, RECIPE_FILE, Workspace, disk_errors
 from hodge_pipeline.types import Source
 from hodge_pipeline.types.notes import Note, notes_of
 
@@ -59,7 +59,7 @@ def run(
     with (
         Workspace.open(folder, binding.unbind(recipe), overwrite=overwrite) as workspace,
         disk_errors(folder),
-        logging_to(folder / "log.txt"),
+        logging_to(folder / LOG_FILE),
     ):
         store = Store(workspace.steps, watcher)
         return _Run(recipe, workspace.folder, store, live, dask, opened, strict=strict).finished()
@@ -84,7 +84,7 @@ def solve_again(folder: Path | str, *, watcher: Watcher | None = None, dask: str
     with (
         Workspace.reopen(folder, binding.unbind(recipe)) as workspace,
         disk_errors(folder),
-        logging_to(folder / "log.txt"),
+        logging_to(folder / LOG_FILE),
     ):
         return _Run(recipe, workspace.folder, Store(workspace.steps, watcher), dask=dask, again=True).finished()
 

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from hodge_pipeline.errors import WorkspaceError
-from hodge_pipeline.recording.run import FILE, Recording
+from hodge_pipeline.recording.run import Recording
 from hodge_pipeline.run_folder import Run, check_layout
 from hodge_pipeline.scene import key_source
 from hodge_pipeline.sources.opening import fingerprints, remembered
 from hodge_pipeline.store.log import log, logging_to
 from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.store.store import Store
-from hodge_pipeline.store.workspace import holding
+from hodge_pipeline.store.workspace import LOG_FILE, RECORDING_FILE, holding
 from hodge_pipeline.types import Source
 
 PARTS = "recording"
@@ -34,7 +34,7 @@ def record_again(folder: Path, options: Mapping[str, Any], watcher: Watcher | No
     changed = replace(recipe, recording=replace(recipe.recording, **options))
     if changed.recording.level == "off":
         raise WorkspaceError(f"{folder}: its recipe records nothing: add --level normal")
-    with holding(folder), logging_to(folder / "log.txt"):
+    with holding(folder), logging_to(folder / LOG_FILE):
         log.info("recording made again from the run folder")
         (folder / PARTS).mkdir(exist_ok=True)
         store = Store(folder / PARTS, watcher)
@@ -43,7 +43,7 @@ def record_again(folder: Path, options: Mapping[str, Any], watcher: Watcher | No
         with Recording(store, folder, changed, source) as recording:
             recording.begin(source, run.clouds, run.rounds[0])
             _record(run, recording)
-    return folder / FILE, run.ending is not None
+    return folder / RECORDING_FILE, run.ending is not None
 
 
 def _with_images(run: Run, store: Store) -> Source:

@@ -29,7 +29,9 @@ REVOLUTION_S = (0.01, 2.0)
 """A spinning scanner's: it tells seconds from milli-, micro- and nanoseconds."""
 NAMES = frozenset((*"xyz", *COLOURS, *PACKED, *NORMALS[0], *NORMALS[1]))
 MAX_METRES = 1e9
+"""A point with a coordinate beyond counts as one without numbers: no map of the Earth has it."""
 ROWS_IN_PART, LINES_IN_PART = 1 << 20, 1 << 17
+"""Read at once: so a file of any length takes some tens of megabytes."""
 Columns: TypeAlias = Mapping[str, Any]
 Corner: TypeAlias = tuple[float, float, float]
 ZERO: Corner = (0.0, 0.0, 0.0)

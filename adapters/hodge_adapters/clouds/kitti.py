@@ -34,6 +34,7 @@ SCANS_LOOKED_AT = 9
 NEAREST_M = 5.0
 """Nearer points tell less of a beam's angle: lasers lie up to 20 cm from the origin that angles are taken at."""
 NUMBERS_LOOKED_AT = 1024
+"""Of a file: coordinates fall somewhere among far fewer."""
 _NUMBERED = re.compile(r"\d(\.pcd)?\.bin$")
 
 

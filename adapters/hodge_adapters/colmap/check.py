@@ -22,6 +22,7 @@ from hodge_pipeline.types.input_files import beginning, open_input
 
 REMEDY = "write the model again with `colmap model_converter`"
 MAX_NAME_BYTES = 4096
+"""The longest path that Linux takes."""
 MARKS = codecs.BOM_UTF8, codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 _U32, _I32, _U64 = struct.Struct("<I"), struct.Struct("<i"), struct.Struct("<Q")
 

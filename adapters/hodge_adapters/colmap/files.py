@@ -13,8 +13,10 @@ from hodge_pipeline.types.text import counted
 
 MODEL_PLACES = ("", "sparse", "sparse/0", "0", "colmap/sparse/0", "colmap", "dense/sparse", "dense/0/sparse")
 PARENTS = 3
-LOOKED_AT = 60
-NAMED = 3
+"""Folders above a model in which what belongs to it is looked for: `project/sparse/0` has it in `project`, and a folder
+more is left for a model that was put deeper."""
+LOOKED_AT, NAMED = 60, 3
+"""Models below a folder without one that are looked at, of each depth, and told."""
 IMAGE_FOLDERS = ("images", "image", "rgb", "color")
 ENDINGS = (".bin", ".txt")
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")

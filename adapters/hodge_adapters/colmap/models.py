@@ -10,6 +10,7 @@ from pathlib import Path
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from hodge_adapters.colmap.beside import DepthOptions, EdgeOptions, PriorOptions
 from hodge_adapters.colmap.bundle import Refine
 from hodge_adapters.colmap.content import checked_content, read_model
 from hodge_adapters.colmap.database import database_names, has_verified_pairs
@@ -29,7 +30,7 @@ from hodge_adapters.colmap.reader import ColmapReader
 from hodge_adapters.colmap.records import Model
 from hodge_adapters.colmap.scale import other_camera_note
 from hodge_adapters.colmap.ties import similarity, tie_points
-from hodge_adapters.colmap.tracked import ColmapModel, DepthOptions, EdgeOptions, PriorOptions
+from hodge_adapters.colmap.tracked import ColmapModel
 from hodge_adapters.colmap.union import united
 from hodge_adapters.images import pixels
 from hodge_pipeline.errors import SourceError

@@ -6,7 +6,7 @@ frames: all cameras of a rig at one moment, or a single image.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,11 +14,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from hodge_adapters.colmap.beside import DepthOptions, EdgeOptions, PriorOptions
 from hodge_adapters.colmap.bodies import Bodies, bodies_of, body_graph
 from hodge_adapters.colmap.bundle import Refine, adjust
 from hodge_adapters.colmap.calibration_changes import calibration_changes
 from hodge_adapters.colmap.content import content_of, read_reconstruction, refreshed
-from hodge_adapters.colmap.database import Known, database_pairs
+from hodge_adapters.colmap.database import database_pairs
 from hodge_adapters.colmap.edges import covisible_pairs, measured_graph
 from hodge_adapters.colmap.points import (
     parallaxes,
@@ -56,35 +57,6 @@ LEAST_LEFT = 3
 
 FEW_BEHIND = 0.01
 """Of the observations: where more are behind their cameras, these are wrong and not the points."""
-
-
-@dataclass(frozen=True)
-class DepthOptions:
-    """Depth beside the images: the file of each image by its name, and how to read it."""
-
-    files: dict[str, Path]
-    units_per_metre: float
-    no_depth: tuple[int, ...]
-    camera: tuple[float, float, float, float] | None = None
-
-
-@dataclass(frozen=True)
-class EdgeOptions:
-    """Where the relative poses come from, and how many points they need."""
-
-    database: Path | None
-    min_shared: int
-    max_edges_per_image: int
-    seed: int
-
-
-@dataclass(frozen=True)
-class PriorOptions:
-    """What is known of images by name beside their pixels, the file it comes from, and sigma where none is stated."""
-
-    images: Mapping[str, Known] = field(default_factory=dict)
-    file: Path | None = None
-    sigma_m: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import numpy as np
 from hodge_adapters.colmap.pycolmap_import import pycolmap
 
 SAME_PARAMS = 1e-9
+"""Share by which parameters of one camera may differ: what rounding leaves of them in a text file."""
 
 
 def united(first: pycolmap.Reconstruction, second: pycolmap.Reconstruction) -> pycolmap.Reconstruction:

@@ -22,6 +22,7 @@ from hodge_adapters.mcap.topics import (
     size_text,
 )
 from hodge_adapters.text_rows import listed
+from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera, Floats
 
@@ -84,7 +85,7 @@ def _is_copy(one: Camera, other: Camera) -> bool:
 
 def _held(poses: Floats) -> Floats | None:
     """The motion (4, 4) that all of these known poses (N, 4, 4) are; None where they differ, or none is known."""
-    known = poses[np.isfinite(poses).all(axis=(1, 2))]
+    known = poses[se3.has_pose(poses)]
     return known[0] if len(known) and np.ptp(known, axis=0).max() < SAME_MOTION else None
 
 

@@ -182,13 +182,11 @@ class G2oReader:
 def write_g2o(path: Path | str, graph: ViewGraph, world_from_vertex: Floats | None = None) -> None:
     """One g2o file, written atomically: ids, order and values survive a round trip to the last bit of a float64.
 
-    A graph of dimension 2 becomes SE2 lines. Raises `SourceError` where ids are no integers.
+    A graph of dimension 2 becomes SE2 lines; vertices with names, which g2o cannot hold, are numbered by their rows.
     """
     dimension = graph.dimension
-    path = Path(path)
-    if not np.issubdtype(graph.vertex_ids.dtype, np.integer):
-        raise SourceError(f"{path}: g2o vertices need integer ids, not {graph.vertex_ids.dtype}: number them first")
-    ids = graph.vertex_ids.astype(np.int64)
+    named = graph.vertex_ids.dtype.kind not in "iu"
+    ids = np.arange(graph.vertex_count) if named else graph.vertex_ids.astype(np.int64)
     lines: list[str] = []
     vertex_tag, edge_tag = ("VERTEX_SE2", "EDGE_SE2") if dimension == 2 else ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
     if world_from_vertex is not None:
@@ -201,7 +199,7 @@ def write_g2o(path: Path | str, graph: ViewGraph, world_from_vertex: Floats | No
         poses, information = _pose_columns(known.world_from_vertex, dimension), known.information
         columns = _information_columns(information, dimension)
         g2o_priors.write_priors(lines, dimension, ids[known.vertices], poses, columns)
-    write_text_atomically(path, "\n".join(lines) + "\n")
+    write_text_atomically(Path(path), "\n".join(lines) + "\n")
 
 
 @stage(frozen=True, config=ConfigDict(extra="forbid"))

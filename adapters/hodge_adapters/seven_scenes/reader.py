@@ -42,6 +42,7 @@ from hodge_adapters.seven_scenes.files import (
     with_depth,
 )
 from hodge_adapters.text_rows import listed
+from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Camera, Floats, Frame, Source, Trajectory
@@ -232,6 +233,6 @@ class SevenScenesReader:
 
 
 def _trajectory(usable: Sequence[FrameFiles], poses: Floats) -> Trajectory | None:
-    good = np.isfinite(poses).all(axis=(1, 2))
+    good = se3.has_pose(poses)
     stamps = np.array([files.number for files in usable], np.float64)
     return Trajectory(stamps[good], poses[good]) if good.any() else None
