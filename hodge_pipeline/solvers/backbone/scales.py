@@ -92,7 +92,7 @@ class Scales:
 
     def differ_much(self, other: Scales) -> bool:
         """Whether one of them differs from the other's by over a standard deviation of the prior."""
-        return bool((np.abs(np.log(astuple(self)) - np.log(astuple(other))) > FOLD).any())
+        return bool((np.abs(np.log(astuple(self)) - np.log(astuple(other))) > np.log(2.0)).any())
 
     def at_solution(self, fit: Fit) -> Scales:
         """These scales, by which the fit was made, times how much larger residuals are there than they should be: the
