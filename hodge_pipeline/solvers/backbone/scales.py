@@ -91,7 +91,7 @@ class Scales:
         return bool(max(self.loop_turn, self.loop_shift) > np.exp(FOLD))
 
     def differ_much(self, other: Scales) -> bool:
-        """Whether one of them differs from the other's by over a standard deviation of the prior."""
+        """Whether one of them is over twice or less than half the other's: enough for other loops to agree."""
         return bool((np.abs(np.log(astuple(self)) - np.log(astuple(other))) > np.log(2.0)).any())
 
     def at_solution(self, fit: Fit) -> Scales:
