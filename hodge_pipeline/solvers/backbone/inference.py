@@ -185,12 +185,12 @@ class _Trial:
 
     def settled(self, used: Bools, rated: _Rated) -> Inferred:
         """The loops that agree from these on (M,), of places that are right together."""
-        shares, linear, of_places = rated.shares, rated.linear, -np.inf
+        shares, linear = rated.shares, rated.linear
         start, chain, trusted = self.start, self.start.chain, self.trusted
         fold = int(chain.broken.sum()) * float(np.log(chain.size))  # for the choice of the broken steps among all
         for _ in range(MOST_ANEW):
             agreed, judged, linear = self.agreed(used | trusted, shares, linear)
-            before, used, confirmed = used, agreed, False
+            before, used, confirmed, of_places = used, agreed, False, -np.inf
             if not agreed.any() or (judged.factor[agreed] - np.log(agreed.sum())).sum() <= by_chance(int(agreed.sum())):
                 break
             places = Places.of(start, self.alone, agreed, self.outliers)
