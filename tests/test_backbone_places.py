@@ -13,9 +13,12 @@ import pytest
 from backbone_graphs import Drive, at_one_place, drive, field, two_laps
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.refine.pose_graph import read_graph
+from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced
+from hodge_pipeline.solvers.backbone.inference import _Trial
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.places import Arrangement, Places
+from hodge_pipeline.solvers.backbone.scales import Scales
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from test_backbone import NEVER_WORSE, chain_of
 from test_solver_robust import rings, spoiled
@@ -56,6 +59,23 @@ def test_rows_that_are_taken_for_the_next_ones_wait_for_stronger_loops(seed: int
     found = diagnose(made.graph)
     np.testing.assert_array_equal(found.kept, made.right)
     assert made.error_m(found.world_from_cam) < 0.15
+
+
+def test_places_whose_loops_are_not_confirmed_again_are_not_likely(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The log-odds of the places that they were dropped from made them win over a confirmed answer."""
+    chain, found, agreed = chain_of(field(0).graph), [], _Trial.agreed
+
+    def once(self: _Trial, *given: Any) -> Any:
+        used, *rest = agreed(self, *given)
+        found.append(used)
+        return used & (len(found) == 1), *rest
+
+    monkeypatch.setattr(_Trial, "agreed", once)
+    outliers, none = OutlierModel.of(chain), np.zeros(len(chain.ends), bool)
+    trial = _Trial.of(chain, outliers, none, True, Scales(), EVEN)
+    settled = trial.settled(*trial.grown(trial.standing_out, trial.start, trial.shares))
+    assert len(found) == 2 and not settled.confirmed
+    assert settled.of_places == -np.inf
 
 
 @pytest.mark.parametrize(

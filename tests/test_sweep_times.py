@@ -70,7 +70,7 @@ def times_judged(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_sweeps_of_given_poses_are_deskewed_by_them() -> None:
     frames = corner()
     exact = true_at([frame.stamp_s - UNIX_S for frame in frames])
-    noise = np.random.default_rng(0).normal(0, [5e-4] * 3 + [0.02] * 3, (len(frames), 6))
+    noise = np.random.default_rng(0).normal(0, [5e-4] * 3 + [0.04] * 3, (len(frames), 6))
     given = exact @ se3.exp(np.cumsum(noise, axis=0))
     refined = refine_trajectory(given, frames, overrides=["recording.level=off", "executor.workers=0"])
     assert not refined.decision.keeps_input

@@ -27,7 +27,8 @@ from hodge_pipeline.solvers.setup import InitialName
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.sources.unknown import without_frames
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.store.workspace import GRAPH_FILE, SOLVED_FILE
+from hodge_pipeline.store.edge_table import read_edges
+from hodge_pipeline.store.workspace import EDGES_FILE, GRAPH_FILE, SOLVED_FILE
 from hodge_pipeline.types import Bools, Floats, Solution, Source, Trajectory, ViewGraph
 from hodge_pipeline.types.text import command, counted
 
@@ -142,17 +143,31 @@ def read_graph(path: Path) -> Source:
 
     Raises `SourceError` where there is no graph, `WorkspaceError` where the folder of a solve is damaged.
     """
-    in_metres = not (path / SOLVED_FILE).is_file() or _in_metres(path / SOLVED_FILE)
-    path = path / GRAPH_FILE if (path / GRAPH_FILE).is_file() else path
+    folder, path = path, path / GRAPH_FILE if (path / GRAPH_FILE).is_file() else path
     reader = guess_reader(path)
     source = reader.open(path)
-    if source.graph is None:
+    graph = source.graph
+    if graph is None:
         recipe = registry.name_of(reader) if registry.name_of(reader) in recipe_names() else "RECIPE"
         run = command("hodge", "run", recipe, "--source", path, "--out", "RUN")
         rest = f"; its frames give one: {run}, then give RUN" if source.frames else f" but {without_frames(source)}"
         raise SourceError(f"{path}: holds no graph of measured edges{rest}")
-    notes = (*inverted_notes(source.graph), *source.notes)
-    return replace(source, notes=notes, in_metres=source.in_metres and in_metres)
+    source = replace(source, notes=(*inverted_notes(graph), *source.notes))
+    if not (folder / SOLVED_FILE).is_file():
+        return source
+    in_metres = source.in_metres and _in_metres(folder / SOLVED_FILE)
+    return replace(source, graph=_with_names(graph, folder / EDGES_FILE), in_metres=in_metres)
+
+
+def _with_names(graph: ViewGraph, table: Path) -> ViewGraph:
+    """The graph with the names that its vertices have in the table of a solve's edges, which g2o cannot hold."""
+    edges, names = read_edges(table)
+    if len(edges) != graph.edge_count:
+        return graph
+    known = dict(zip(graph.edges.ravel().tolist(), names[edges.pairs].ravel().tolist(), strict=True))
+    numbers = graph.vertex_ids.astype(np.str_).tolist()
+    called = [known.get(row, number) for row, number in enumerate(numbers)]
+    return graph if called == numbers else replace(graph, vertex_ids=np.array(called))
 
 
 def _in_metres(solved: Path) -> bool:

@@ -159,7 +159,7 @@ class _Trial:
         by_halves = self.halves_grown(np.flatnonzero(out))
         if (by_halves[0] == at_once[0] & out).all():
             return found
-        return max(found, self.settled(*self.grown(*by_halves)), key=lambda each: each.of_places)
+        return max(found, self.settled(*self.grown(*by_halves)), key=lambda each: (each.confirmed, each.of_places))
 
     @property
     def standing_out(self) -> Bools:
@@ -177,7 +177,7 @@ class _Trial:
             alone=Judged(alone.log_odds[rows], alone.factor[rows], alone.chi2[rows], alone.log_wrong[rows]),
             trusted=self.trusted[rows],
         )
-        begin = _stronger_half(some.alone.factor, some.standing_out) | some.trusted
+        begin = _stronger_half(some.alone.factor, np.ones(len(rows), bool)) | some.trusted
         some_used, rated = some.grown(begin, some.start, self.shares, _stronger_half)
         used = np.zeros_like(self.trusted)
         used[rows] = some_used
@@ -185,12 +185,12 @@ class _Trial:
 
     def settled(self, used: Bools, rated: _Rated) -> Inferred:
         """The loops that agree from these on (M,), of places that are right together."""
-        shares, linear, of_places = rated.shares, rated.linear, -np.inf
+        shares, linear = rated.shares, rated.linear
         start, chain, trusted = self.start, self.start.chain, self.trusted
         fold = int(chain.broken.sum()) * float(np.log(chain.size))  # for the choice of the broken steps among all
         for _ in range(MOST_ANEW):
             agreed, judged, linear = self.agreed(used | trusted, shares, linear)
-            before, used, confirmed = used, agreed, False
+            before, used, confirmed, of_places = used, agreed, False, -np.inf
             if not agreed.any() or (judged.factor[agreed] - np.log(agreed.sum())).sum() <= by_chance(int(agreed.sum())):
                 break
             places = Places.of(start, self.alone, agreed, self.outliers)

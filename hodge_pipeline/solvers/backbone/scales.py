@@ -29,6 +29,10 @@ FOLD = np.log(4.0)
 """Prior standard deviation of the logarithm of a scale: stated information is seldom wrong by more."""
 FINEST = np.log(2.0) / 2
 """Last step of the search, in the logarithm of a scale; the first is `FOLD`."""
+DIFFERENT = 2 * FINEST - 1e-9
+"""Difference of logarithms from which two scales differ much: two last steps of the search. Learned scales are often
+exactly so far apart, of which rounding must not decide.
+"""
 MOST_RATIO = np.log(2.0)
 """Largest log-ratio of the scales of rotation and of translation, where information is stated."""
 SMALLER = np.log(4.0) * np.array([0, -1, -2])
@@ -91,8 +95,8 @@ class Scales:
         return bool(max(self.loop_turn, self.loop_shift) > np.exp(FOLD))
 
     def differ_much(self, other: Scales) -> bool:
-        """Whether one of them is over twice or less than half the other's: enough for other loops to agree."""
-        return bool((np.abs(np.log(astuple(self)) - np.log(astuple(other))) > np.log(2.0)).any())
+        """Whether one of them differs from the other's twofold or more."""
+        return bool((np.abs(np.log(astuple(self)) - np.log(astuple(other))) > DIFFERENT).any())
 
     def at_solution(self, fit: Fit) -> Scales:
         """These scales, by which the fit was made, times how much larger residuals are there than they should be: the
