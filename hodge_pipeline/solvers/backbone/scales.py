@@ -29,9 +29,10 @@ FOLD = np.log(4.0)
 """Prior standard deviation of the logarithm of a scale: stated information is seldom wrong by more."""
 FINEST = np.log(2.0) / 2
 """Last step of the search, in the logarithm of a scale; the first is `FOLD`."""
-DIFFERENT = 2 * FINEST - 1e-9
-"""Difference of logarithms from which two scales differ much: two last steps of the search. Learned scales are often
-exactly so far apart, of which rounding must not decide.
+DIFFERENT = 2 * FINEST + 1e-9
+"""Difference of logarithms beyond which two scales differ much: over two last steps of the search. Learned scales are
+often exactly so far apart, of which rounding must not decide; to count them as different takes RobotCar's 2438 loops
+from 2.3 to 3.6 CPU s, and from 2.76 to 2.63 m.
 """
 MOST_RATIO = np.log(2.0)
 """Largest log-ratio of the scales of rotation and of translation, where information is stated."""
@@ -95,7 +96,7 @@ class Scales:
         return bool(max(self.loop_turn, self.loop_shift) > np.exp(FOLD))
 
     def differ_much(self, other: Scales) -> bool:
-        """Whether one of them differs from the other's twofold or more."""
+        """Whether one of them differs from the other's more than twofold."""
         return bool((np.abs(np.log(astuple(self)) - np.log(astuple(other))) > DIFFERENT).any())
 
     def at_solution(self, fit: Fit) -> Scales:
