@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
 
@@ -9,9 +12,11 @@ from backbone_graphs import Drive, drive
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.result import UNTESTABLE
+from hodge_pipeline.solvers.backbone.bridged import JoinEvidence
+from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.sequence import consecutive_edges
 from hodge_pipeline.solvers.maximum_likelihood import solve
-from hodge_pipeline.types import Bools, ViewGraph
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 CUT = 300
 
@@ -119,6 +124,23 @@ def test_robots_that_meet_after_long_paths_are_joined() -> None:
     """
     found = diagnose(meetings(seed=6, robots=8, steps=150, count=20, together=12))
     assert found.kept.all()
+
+
+@pytest.mark.parametrize(("far", "one", "rivals"), [(-1.0, -1.0, ()), (-5.0, -1.0, ()), (-5.0, -5.0, (4,))])
+def test_loops_that_drift_leaves_untested_are_no_rivals(far: float, one: float, rivals: tuple[int, ...]) -> None:
+    """Of ten robots 207 of 326 right loops counted where the first loop of a group spoke for all of it."""
+    group = np.array([0] * 5 + [1] * 4)
+
+    def factor(first: Ints, second: Ints) -> Floats:
+        apart = np.where(second == 8, one, far)
+        return np.where(group[first] == group[second], 5.0, apart)
+
+    places = np.repeat(10.0 * group[:, None], 2, axis=1)
+    pairwise = SimpleNamespace(
+        chain=SimpleNamespace(places=places), factor=factor, log_wrong=np.zeros(9), seeds=lambda rows: ()
+    )
+    found = JoinEvidence.of(cast(PairwiseConsistency, pairwise), np.arange(9))
+    assert (found.size, found.rivals) == (5, rivals)
 
 
 def meetings(seed: int, robots: int, steps: int, count: int, together: int) -> ViewGraph:
