@@ -51,6 +51,11 @@ class Inferred:
     confirmed: bool
     of_places: float
 
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """By which the best of several answers is chosen."""
+        return self.confirmed, self.of_places
+
     @cached_property
     def polished(self) -> tuple[Linear, Floats]:
         """The chain at the final poses, and factors (M,) on the loops' standard deviations: see `polished`."""
@@ -73,7 +78,7 @@ def infer(
         other = _Trial.of(chain, outliers, trusted, may_thin, *given).found()
         if other is None:
             return None
-        found = other if found is None or other.of_places > found.of_places else found
+        found = other if found is None or other.rank > found.rank else found
     for _ in range(MOST_ANEW if scales is None else 0):
         if found is None or not found.confirmed:
             break
@@ -81,7 +86,7 @@ def infer(
         if not found.scales.differ_much(here) or not _others_agree(found, here.applied(chain), outliers, trusted):
             break
         other = _Trial.of(chain, outliers, trusted, may_thin, here, EVEN).found()
-        if other is None or other.of_places <= found.of_places:
+        if other is None or other.rank <= found.rank:
             break
         found = other
     return found
@@ -159,7 +164,7 @@ class _Trial:
         by_halves = self.halves_grown(np.flatnonzero(out))
         if (by_halves[0] == at_once[0] & out).all():
             return found
-        return max(found, self.settled(*self.grown(*by_halves)), key=lambda each: (each.confirmed, each.of_places))
+        return max(found, self.settled(*self.grown(*by_halves)), key=lambda each: each.rank)
 
     @property
     def standing_out(self) -> Bools:
@@ -170,13 +175,9 @@ class _Trial:
         """Which of the loops `rows (K,)` are used (M,) where in each round the stronger half of those that stand out is
         added; the poses and shares that these lead to.
         """
-        chain, alone = self.start.chain, self.alone
-        some = replace(
-            self,
-            start=replace(self.start, chain=chain.with_loops(rows, chain.ends[rows])),
-            alone=Judged(alone.log_odds[rows], alone.factor[rows], alone.chi2[rows], alone.log_wrong[rows]),
-            trusted=self.trusted[rows],
-        )
+        chain = self.start.chain
+        start = replace(self.start, chain=chain.with_loops(rows, chain.ends[rows]))
+        some = replace(self, start=start, alone=self.alone.select(rows), trusted=self.trusted[rows])
         begin = _stronger_half(some.alone.factor, np.ones(len(rows), bool)) | some.trusted
         some_used, rated = some.grown(begin, some.start, self.shares, _stronger_half)
         used = np.zeros_like(self.trusted)

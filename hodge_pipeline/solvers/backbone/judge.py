@@ -30,6 +30,10 @@ class Judged:
     chi2: Floats
     log_wrong: Floats
 
+    def select(self, rows: Ints) -> Judged:
+        """The loops `rows (K,)` alone."""
+        return Judged(self.log_odds[rows], self.factor[rows], self.chi2[rows], self.log_wrong[rows])
+
 
 def judge(linear: Linear, fit: Fit | None, shares: Floats, outliers: OutlierModel) -> Judged:
     """The loops judged at the poses of a fit, or of the bare chain; `shares (2,)`: prior, of right and wrong loops."""

@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import expit
 
-from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import chi2_by_information, has_unit_information, tail_gate, tail_weight
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone.bridged import MOST_BREAKS, infer_bridged
 from hodge_pipeline.solvers.backbone.chain import Chain, make_chain
 from hodge_pipeline.solvers.backbone.credible import credible_steps
 from hodge_pipeline.solvers.backbone.inference import Inferred
-from hodge_pipeline.solvers.backbone.linear import Linear
+from hodge_pipeline.solvers.backbone.linear import Linear, inverse
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.parallel import Fused, fused, loops_once
 from hodge_pipeline.solvers.backbone.polish import LOCAL
@@ -86,7 +85,9 @@ class Backbone:
         whole[:, self.chain.axes] = width
         information = graph.information / (whole[:, :, None] * whole[:, None, :])
         if unit:
-            information = 0.5 * (information + se3.pull_back(graph.i_from_j, information))
+            rows = np.arange(graph.edge_count)[:, None, None]
+            axes = rows, self.chain.axes[:, None], self.chain.axes
+            information[axes] = inverse(self.chain.of_both_ends(graph.i_from_j, inverse(information[axes])))
         return replace(graph, information=information).select(np.flatnonzero(self.used))
 
     def places(self, edges: Bools) -> int:
