@@ -7,6 +7,7 @@
     python -m benchmarks.wrong_loops simulated --seed 1  # walks with 0 to 200 wrong loops, alone and in groups
     python -m benchmarks.wrong_loops short --seed 1      # walks of 15 to 95 steps with few loops, some steps wrong
     python -m benchmarks.wrong_loops mistaken --seed 1   # walks with a loop a step, many of them mistaken in one way
+    python -m benchmarks.wrong_loops alike --seed 1      # storeys, decks and rows taken for the next
     python -m benchmarks.wrong_loops lattices --seed 1   # cylinders and grids with 1 to 20 % of all edges wrong
     python -m benchmarks.wrong_loops windows --seed 1    # walks with edges over two steps to ten: a sliding window
     python -m benchmarks.wrong_loops sessions --seed 1   # walks cut into two to five sessions that loops alone join
@@ -27,6 +28,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+from alike_worlds import alike_cases
 from edges_peers import consecutive as steps
 from slam_loops import odometry, position_error
 from spoilt_graphs import KINDS, Case
@@ -42,12 +44,13 @@ MORE = 1.02
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("kind", choices=KINDS)
+    kinds = {**KINDS, "alike": alike_cases}
+    parser.add_argument("kind", choices=kinds)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="graphs whose name has this word")
     arguments = parser.parse_args()
     print("graph | edges, wrong | odometry m | right alone m | result m | wrong kept, right blamed | CPU s", flush=True)
-    cases = [case for case in KINDS[arguments.kind](arguments.seed) if arguments.only in case.name]
+    cases = [case for case in kinds[arguments.kind](arguments.seed) if arguments.only in case.name]
     total, worse, kept, blamed = 0.0, 0, 0, 0
     for case in cases:
         before = time.process_time()

@@ -74,8 +74,8 @@ def test_the_reduced_chain_ends_at_the_minimum_over_all_poses(monkeypatch: pytes
 
 
 def test_an_odometry_that_turns_wrongly_by_six_degrees_a_step_is_solved(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tests.backbone_graphs.STEP", (0.1, 0.1))
-    monkeypatch.setattr("tests.backbone_graphs.LOOP", (0.1, 0.1))
+    monkeypatch.setattr("backbone_graphs.STEP", (0.1, 0.1))
+    monkeypatch.setattr("backbone_graphs.LOOP", (0.1, 0.1))
     made = drive(seed=2, count=800, loops=390, wrong=0.0, world="room")
     found = find_backbone(made.graph)
     assert found is not None

@@ -27,7 +27,7 @@ from test_solver_robust import rings, spoiled
 
 def city(monkeypatch: pytest.MonkeyPatch, seed: int) -> Drive:
     """A long drive whose odometry turns by .7 degrees a step too much or too little, with wrong loops in groups."""
-    monkeypatch.setattr("tests.backbone_graphs.STEP", (0.012, 0.03))
+    monkeypatch.setattr("backbone_graphs.STEP", (0.012, 0.03))
     return at_one_place(drive(seed=seed, count=1200, world="town", wrong=0.0, loops=250), 600, group=5, seed=seed)
 
 
@@ -44,7 +44,7 @@ def test_loops_of_little_evidence_wait_for_those_that_say_more(monkeypatch: pyte
     """An odometry that turns by a degree a step refutes no loop over hundreds of steps: all that were a little likelier
     right counted at once, and a mistaken place among them bent the path until right ones did not fit, 5.9 m off.
     """
-    monkeypatch.setattr("tests.backbone_graphs.STEP", (0.02, 0.05))
+    monkeypatch.setattr("backbone_graphs.STEP", (0.02, 0.05))
     made = drive(world="town", count=1500, loops=500, wrong=0.4, in_groups=True, group=10)
     found = diagnose(made.graph)
     np.testing.assert_array_equal(found.kept, made.right)

@@ -9,9 +9,11 @@ import numpy as np
 from numpy import str_
 from numpy.typing import NDArray
 
+from hodge_pipeline import se3
 from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.diagnosis.cycles import Cycles
 from hodge_pipeline.evaluation.residuals import edge_residuals
+from hodge_pipeline.solvers.backbone.sequence import vertex_ranks
 from hodge_pipeline.solvers.resistance import Network, effective_resistance
 from hodge_pipeline.types import Bools, Edges, Floats, Ints, ViewGraph
 
@@ -32,7 +34,7 @@ class Diagnosis:
       piece; 0 for one that is not kept.
     - `information (E, 6, 6)`: that the edges were judged with, in j's axes.
     - `cycles`; `witnesses_for`, `witnesses_against (E, 3)`: their rows, the most telling first, −1 for none.
-    - `piece (V,)`: 0 the largest; `world_from_cam (V, 4, 4)`: each piece in a frame of its own.
+    - `piece (V,)`: 0 the largest; `world_from_cam (V, 4, 4)`: each piece in the frame of its lowest id.
     - `network`: of the kept edges as resistors.
     - `notes`: counts and caveats, one line each.
     """
@@ -73,6 +75,9 @@ class Diagnosis:
         """
         piece = network.component
         apart = piece[graph.edges[:, 0]] != piece[graph.edges[:, 1]]
+        by_id = np.argsort(vertex_ranks(graph))
+        first = by_id[np.unique(piece[by_id], return_index=True)[1]]
+        world_from_cam = se3.inverse(world_from_cam[first])[piece] @ world_from_cam
         displacement_m, angle = edge_residuals(graph, world_from_cam)
         residual = np.where(apart, np.nan, displacement_m), np.where(apart, np.nan, np.degrees(angle))
         leverage = np.where(kept, 1 - 1 / (1 + effective_resistance(graph.edges, kept, network)), 0.0)

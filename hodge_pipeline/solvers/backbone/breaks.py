@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.chi2 import FREEDOM, tail_weight
+from hodge_pipeline.complex.chi2 import FREEDOM, tail_gate, tail_weight
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis, student_log_density
 from hodge_pipeline.solvers.backbone.fit import Fit
 from hodge_pipeline.solvers.backbone.linear import linearise, turned
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.step_model import StepModel
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types import Bools, Floats, Ints
 
 PLATEAU = 12.0
 """Nats below the best step at which a step is no candidate for the break."""
@@ -21,6 +21,8 @@ MOST_UNUSUAL = 3
 """Steps that are tried by their own size alone: a limit on cost."""
 LEAST_COST = 4.0
 """Nats that the residual of a run must cost before its steps are tested: a limit on time."""
+RARE = 0.01
+"""Share of errors beyond which a step is turned, or leads aside."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +55,13 @@ def agreed_breaks(pairwise: PairwiseConsistency, usual: StepModel) -> list[Break
         at, score = at[score > score.max() - PLATEAU], score[score > score.max() - PLATEAU]
         fits = _log_with_usual_step(pairwise, usual, np.full(len(at), seed), at) - pairwise.log_wrong[seed]
         score = score + np.maximum(fits, 0.0) - pairwise.by_chain[seed] + usual.unusual[at]
-        fit = fits > 0
+        may = ~_shifted_aside(pairwise, usual, seed, at)
+        fit, far = may & (fits > 0), may & (fits <= 0)
         found = [_break(pairwise, usual, seed, at[fit], score[fit])] if fit.any() else []
-        if not fit.all():
-            far = _far_break(pairwise, seed, at[~fit], score[~fit])
-            if chain.corridors_over(far.at, rows[(factor > 0) & (gain > 0)]) > 1:  # else no trial will show as many
-                found.append(far)
+        if far.any():
+            broken = _far_break(pairwise, seed, at[far], score[far])
+            if chain.corridors_over(broken.at, rows[(factor > 0) & (gain > 0)]) > 1:  # else no trial will show as many
+                found.append(broken)
         agreeing = rows[(factor > 0) & ~pairwise.used[rows]]
         out += [replace(each, agreeing=agreeing[chain.passes(each.at, agreeing)]) for each in found]
     return sorted(out, key=lambda each: -each.log_evidence)
@@ -92,6 +95,22 @@ def _far_break(pairwise: PairwiseConsistency, loop: int, at: Ints, score: Floats
     row = int(np.argmax(score))
     one = int(at[row])
     return Break(one, *pairwise.bridge(loop, one - 1, one), float(score[row]), usual=False)
+
+
+def _shifted_aside(pairwise: PairwiseConsistency, usual: StepModel, loop: int, at: Ints) -> Bools:
+    """Whether a bridge to positions `at (K,)`, as far as the loop asks for, leads aside of the step by far, and turned
+    as it is. So do loops between floors, or rows, that look alike; a robot that is carried off is turned, and odometry
+    that stands still lags behind.
+    """
+    chain, split = pairwise.chain, pairwise.chain.rotation_axes
+    turn, shift = slice(0, split), slice(split, None)
+    end, covariance = pairwise.predicted(np.full(len(at), loop), at - 1, at)
+    off = chain.log(chain.between(pairwise.linear.poses[at], end))
+    ahead = chain.log(usual.centre)[shift]
+    across = np.linalg.svd(ahead[:, None])[0][:, 1:].T
+    as_it_is = mahalanobis(off[:, turn], covariance[:, turn, turn])[0] < tail_gate(split, RARE)
+    aside = mahalanobis(off[:, shift] @ across.T, across @ covariance[:, shift, shift] @ across.T)[0]
+    return np.asarray(as_it_is & (aside > tail_gate(len(across), RARE)))
 
 
 def unusual_breaks(usual: StepModel) -> list[Break]:

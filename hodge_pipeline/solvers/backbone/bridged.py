@@ -103,16 +103,18 @@ def _as_stated(chain: Chain, found: Inferred, judge: Callable[..., Inferred | No
     motion like larger errors of all loops.
     """
     scales = found.scales.at_most_stated if chain.stated else Scales()
-    larger = chain.stated and (found.scales.steps_surprise or found.scales.loops_surprise)
+    larger = chain.stated and found.scales.exceed_stated
     return judge(chain, scales=scales) if found.scales != scales and (larger or not found.confirmed) else None
 
 
 def _believed(as_stated: Inferred, found: Inferred) -> bool:
-    """Whether loops judged with errors no larger than stated are to be believed rather than with learned ones."""
+    """Whether loops judged with errors no larger than stated are to be believed rather than with learned ones: loops
+    that these explain by larger errors share a mistake, by more nats than their places tell.
+    """
     if not as_stated.confirmed or not as_stated.start.chain.stated:
         return False
-    likelier = found.scales.loops_surprise and as_stated.log_evidence > found.log_evidence
-    return likelier or not found.confirmed
+    shared, told = as_stated.of_mistakes - found.of_mistakes, found.of_places - as_stated.of_places
+    return not found.confirmed or shared > max(told, BY_CHANCE)
 
 
 def _better(
@@ -123,7 +125,8 @@ def _better(
     outliers: OutlierModel,
 ) -> tuple[Chain, Inferred] | None:
     """The chain with one more broken step bridged, and its loops judged; None where no step is broken."""
-    founds = [found] if as_stated is None else [found, as_stated]
+    surprising = found.scales.steps_surprise or found.scales.loops_surprise or not found.confirmed
+    founds = [found] if as_stated is None or not surprising else [found, as_stated]
     for broken, least in [each for one in founds for each in _candidates(chain, one, outliers)]:
         tried = bridged(chain, broken)
         same = judge(tried, scales=found.scales)  # so that nothing but the step differs

@@ -16,6 +16,7 @@ from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, from_rotations, op
 from hodge_pipeline.solvers.backbone.judge import Judged, judge
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
+from hodge_pipeline.solvers.backbone.mistakes import Mistake, mistakes
 from hodge_pipeline.solvers.backbone.places import MISTAKEN, MOST_STEPS, Places
 from hodge_pipeline.solvers.backbone.polish import polished
 from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
@@ -55,6 +56,16 @@ class Inferred:
     def rank(self) -> tuple[bool, float]:
         """By which the best of several answers is chosen."""
         return self.confirmed, self.of_places
+
+    @cached_property
+    def mistakes(self) -> list[Mistake]:
+        """Groups of unused loops that are mistaken in one way."""
+        return mistakes(self.linear, self.judged.log_wrong, self.used)
+
+    @property
+    def of_mistakes(self) -> float:
+        """By how many nats unused loops are likelier for these mistakes."""
+        return sum(each.nats for each in self.mistakes)
 
     @cached_property
     def polished(self) -> tuple[Linear, Floats]:

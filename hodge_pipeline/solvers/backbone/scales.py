@@ -95,6 +95,11 @@ class Scales:
         """Whether loops err more than what they state by over a standard deviation of the prior."""
         return bool(max(self.loop_turn, self.loop_shift) > np.exp(FOLD))
 
+    @property
+    def exceed_stated(self) -> bool:
+        """Whether some errors are at least twice what they are stated to be."""
+        return bool(np.log(max(astuple(self))) > DIFFERENT - FINEST)
+
     def differ_much(self, other: Scales) -> bool:
         """Whether one of them differs from the other's more than twofold."""
         return bool((np.abs(np.log(astuple(self)) - np.log(astuple(other))) > DIFFERENT).any())

@@ -13,6 +13,7 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone.bridged import MOST_BREAKS, infer_bridged
 from hodge_pipeline.solvers.backbone.chain import Chain, make_chain
 from hodge_pipeline.solvers.backbone.credible import credible_steps
+from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE
 from hodge_pipeline.solvers.backbone.inference import Inferred
 from hodge_pipeline.solvers.backbone.linear import Linear, inverse
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
@@ -120,7 +121,16 @@ class Backbone:
             errors = f"; these edges then err {scales.of_steps:.2g} times what they state, or the loops are wrong alike"
         else:
             errors = ""
-        return f"{trusted}{called_wrong}, {used} of {loops} loops confirmed{errors}"
+        return f"{trusted}{called_wrong}, {used} of {loops} loops confirmed{errors}{self._shared_mistake}"
+
+    @property
+    def _shared_mistake(self) -> str:
+        """Where most unused loops agree on one shift: how many, and how far."""
+        found, most = self.found, max(self.found.mistakes, key=lambda each: len(each.rows), default=None)
+        if most is None or most.nats < BY_CHANCE or 2 * len(most.rows) < (~found.used).sum():
+            return ""
+        away = np.linalg.norm(found.linear.loops[0][most.rows, self.chain.rotation_axes :], axis=1)
+        return f"; {len(most.rows)} others agree on a shift of {np.median(away):.3g} m: places that look alike"
 
 
 def find_backbone(

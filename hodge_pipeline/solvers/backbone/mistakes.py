@@ -1,0 +1,40 @@
+"""Loops that are mistaken in one way: between floors that look alike, or from each row of a field to the next one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hodge_pipeline.solvers.backbone.linear import Linear
+from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
+from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
+from hodge_pipeline.types import Bools, Floats, Ints
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """Loops `rows (K,)` that agree with each other but for one motion of the world, and by how many nats they are
+    likelier for it, beside the place that tells this motion and its choice among all places.
+    """
+
+    rows: Ints
+    nats: float
+
+
+def mistakes(linear: Linear, log_wrong: Floats, used: Bools) -> list[Mistake]:
+    """Groups of the loops that are not `used (M,)`, each mistaken in one way; `log_wrong (M,)`: the log-density of each
+    residual at the poses of `linear` if the loop is wrong in a way of its own.
+    """
+    rows, out = np.flatnonzero(~used), list[Mistake]()
+    if not len(rows):
+        return out
+    pairwise = PairwiseConsistency.of(linear, log_wrong)
+    fold = float(np.log((1 / loops_at_place(linear.chain.places[rows])).sum()))
+    left = np.ones(len(rows), bool)
+    for seed, factor in pairwise.seeds(rows):
+        nats = float(pairwise.gains(seed, rows, factor)[left].sum()) - fold
+        if nats > 0:
+            out.append(Mistake(rows[left & (factor > 0)], nats))
+            left &= factor <= 0
+    return out

@@ -1,0 +1,31 @@
+"""Floors, decks and rows that look alike: loops that take one for the next share one shift, and are told by it."""
+
+import numpy as np
+import pytest
+
+from backbone_graphs import drive
+from benchmarks.alike_worlds import alike_cases
+from hodge_pipeline.diagnosis.diagnosis import diagnose
+
+TOLD_BY = {
+    "storeys, 70% wrong, 0.005 m a step, stated × 1.0": 3.0,  # a break that leads aside: all 100 were kept, 1.5 m off
+    "one lap a storey, 30% wrong, 0.02 m a step, stated × 1.0": 3.0,  # the shared mistake: 14 were kept, 1.3 m off
+    "rows, 50% wrong, 0.02 m a step, stated × 0.5": 1.5,  # likewise 64, 1.2 m
+}
+
+
+@pytest.mark.parametrize("name", TOLD_BY)
+def test_loops_that_take_a_part_of_the_world_for_the_next_are_left_out_and_told(name: str) -> None:
+    case = next(each for each in alike_cases(1) if each.name == name)
+    found = diagnose(case.graph)
+    np.testing.assert_array_equal(found.kept, case.right)
+    (told,) = (note for note in found.notes if "others agree on a shift of" in note)
+    count, shift = told.split("; ")[-1].split(" others agree on a shift of ")
+    assert int(count) == (~case.right).sum()
+    assert float(shift.split(" m: places that look alike")[0]) == pytest.approx(TOLD_BY[name], abs=0.2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_random_loops_share_no_shift(seed: int) -> None:
+    found = diagnose(drive(seed=seed, world="town", wrong=0.6).graph)
+    assert not any("others agree" in note for note in found.notes)
