@@ -23,6 +23,7 @@ from hodge_pipeline.scene import (
     KeyFrames,
     Round,
     Scene,
+    choose_key_frames,
     has_truth,
     key_source,
     own_trajectory,
@@ -36,7 +37,6 @@ from hodge_pipeline.se3 import spread_correction
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.stages import Steps, Workers
 from hodge_pipeline.start.at_stamps import with_landmarks_at_stamps
-from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.match_poses import Match, Matched, match_poses, own_poses
 from hodge_pipeline.start.odometry import OPTIONS, chain

@@ -21,8 +21,8 @@ from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chaine
 from hodge_pipeline.registration.tracking.blocks import BlockRows, TrackedBlocks
 from hodge_pipeline.registration.tracking.bridging import bridge
 from hodge_pipeline.registration.tracking.focal import estimate_focal
+from hodge_pipeline.registration.tracking.frame import find_repeats
 from hodge_pipeline.registration.tracking.readout import estimate_readout
-from hodge_pipeline.registration.tracking.repeats import find_repeats
 from hodge_pipeline.registration.tracking.shutter import velocities
 from hodge_pipeline.registration.tracking.sightings import views
 from hodge_pipeline.registration.tracking.smoothing import VIDEO_STEP_S

@@ -34,6 +34,7 @@ from hodge_pipeline.registration.sweeps import (
 from hodge_pipeline.scene import (
     KeyFrames,
     Scene,
+    choose_key_frames,
     is_clock,
     sequence_numbers,
     sequences_of,
@@ -41,7 +42,6 @@ from hodge_pipeline.scene import (
     vertex_ids,
 )
 from hodge_pipeline.stages import Advance, Step, Steps, Workers
-from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
 from hodge_pipeline.start.sweep_reading import (
