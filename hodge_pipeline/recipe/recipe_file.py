@@ -142,7 +142,7 @@ def _nested(data: Any, keys: list[str], value: Any, name: str) -> Any:
             raise RecipeError(f"{name}: '{head}' is not a row of a list of {len(data)}")
         row = int(head)
         return [*data[:row], _nested(data[row], rest, value, name), *data[row + 1 :]]
-    if isinstance(data, str) and data in _stage_names():
+    if isinstance(data, str) and any(data in registry.names(kind) for kind in registry.KINDS):
         data = {"stage": data}
     if data is not None and not isinstance(data, dict):
         raise RecipeError(f"{name}: '{head}' lies in a value that has no options: {data!r}")
@@ -150,7 +150,3 @@ def _nested(data: Any, keys: list[str], value: Any, name: str) -> Any:
     if head == "stage" and not rest and old.get("stage") != value:
         return {"stage": value}
     return {**old, head: _nested(old.get(head), rest, value, name)}
-
-
-def _stage_names() -> set[str]:
-    return {name for kind in registry.KINDS for name in registry.names(kind)}

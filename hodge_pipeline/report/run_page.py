@@ -68,6 +68,6 @@ def _subtitle(report: Report) -> str:
     if graph is not None:
         parts = len(graph.components)
         told.append(f"{counted(graph.edges, 'edge')}, {counted(parts, 'connected part')}")
-    if report.stages:
-        told.append(f"{duration(sum(stage.wall_s for stage in report.stages))}{peak(report)}")
+    if (total := report.total) is not None:
+        told.append(f"{duration(total.wall_s)}{peak(total)}")
     return f"{'; '.join(told)}."
