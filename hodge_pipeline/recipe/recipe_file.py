@@ -121,15 +121,12 @@ def _overridden(document: Document, override: str) -> Document:
         raise RecipeError(f"{name}: expected a.b=value")
     given = yaml_file.parse_value(text, name)
     value = given.data["value"]
-    typed, change = _typed(keys), _nested(document.data, keys, value, name)
+    typed = tuple(int(key) if key.isdigit() else key for key in keys)
+    change = _nested(document.data, keys, value, name)
     merges = isinstance(value, dict)
     kept = {key: line for key, line in document.origins.items() if merges or key[: len(typed)] != typed}
     new = {(*typed, *inside[1:]): name for inside in given.origins if inside}
     return Document(change, {**{typed[:end]: name for end in range(1, len(typed))}, **kept, **new})
-
-
-def _typed(keys: list[str]) -> Keys:
-    return tuple(int(key) if key.isdigit() else key for key in keys)
 
 
 def _nested(data: Any, keys: list[str], value: Any, name: str) -> Any:

@@ -94,18 +94,15 @@ def _clustered(model: Model, kept: int) -> Model:
     low = points.min(axis=0)
     voxel_m = max(float(np.ptp(points, axis=0).max()) / 2000, 1e-9)
     while True:
-        _, first, cluster = np.unique(_voxels(points - low, voxel_m), return_index=True, return_inverse=True)
+        cells = np.floor((points - low) / voxel_m).astype(np.int64)
+        voxels = numbered(cells, cells.max(axis=0) + 1)
+        _, first, cluster = np.unique(voxels, return_index=True, return_inverse=True)
         if len(first) <= kept:
             break
         voxel_m *= max(1.05, float(np.sqrt(len(first) / kept)))
     triangles = cluster.reshape(-1)[np.asarray(model.triangles)]
     a, b, c = triangles.T
     return _replace(model, first, triangles[(a != b) & (b != c) & (a != c)].astype(np.int32))
-
-
-def _voxels(offsets: Floats, voxel_m: float) -> Ints:
-    cells = np.floor(offsets / voxel_m).astype(np.int64)
-    return numbered(cells, cells.max(axis=0) + 1)
 
 
 def numbered(cells: Ints, size: Ints) -> Ints:

@@ -15,8 +15,7 @@ where GICP slides by whole steps of 1.4 m, the weakest direction has 0.018 to 0.
 
 def unheld_steps(edges: Edges, min_spread: float) -> Bools:
     """Where (P,) consecutive frames leave a direction of translation unconstrained, as before a bare wall."""
-    weak, _ = weak_directions(edges, HELD_SPREADS * min_spread)
-    return np.asarray(weak.any(axis=1) & consecutive(edges))
+    return may_slide(edges, HELD_SPREADS * min_spread) & consecutive(edges)
 
 
 def held_where_sliding(registered: Edges, guesses: Floats, min_spread: float) -> Edges:
@@ -32,6 +31,11 @@ def held_where_sliding(registered: Edges, guesses: Floats, min_spread: float) ->
     twist[:, 3:] -= slid
     iterations = np.maximum(registered.iterations[rows], 1)
     return registered.put(rows, i_from_j=guesses[rows] @ se3.exp(twist), iterations=iterations)
+
+
+def may_slide(registered: Edges, min_spread: float) -> Bools:
+    """Where (P,) some direction hardly constrains translation."""
+    return np.asarray(weak_directions(registered, min_spread)[0].any(axis=1))
 
 
 def weak_directions(registered: Edges, min_spread: float) -> tuple[Bools, Floats]:

@@ -38,9 +38,9 @@ from hodge_pipeline.scene import (
     stamps_of,
     vertex_ids,
 )
-from hodge_pipeline.stages import Advance, Step, Steps, Workers
+from hodge_pipeline.stages import OPTIONS, Advance, Step, Steps, Workers
 from hodge_pipeline.start.at_stamps import landmarks_at_stamps, other_readout
-from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
+from hodge_pipeline.start.odometry import OdometryStart
 from hodge_pipeline.store.codec import CLOUDS
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Source
 from hodge_pipeline.types.notes import Note, notes_of

@@ -41,9 +41,9 @@ from hodge_pipeline.scene import (
     stamps_of,
     vertex_ids,
 )
-from hodge_pipeline.stages import Advance, Step, Steps, Workers
+from hodge_pipeline.stages import OPTIONS, Advance, Step, Steps, Workers
 from hodge_pipeline.start.clouds import make_clouds
-from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
+from hodge_pipeline.start.odometry import OdometryStart
 from hodge_pipeline.start.sweep_reading import (
     LEFT_OUT,
     NO_CLOCK_S,
