@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline.registration.assessment import MOST_VIOLATION, SAME_FITNESS
 from hodge_pipeline.registration.odometry_path import contradicts_odometry, without_slides
 from hodge_pipeline.registration.seen_through import is_refuted
-from hodge_pipeline.registration.sliding import consecutive, may_slide
+from hodge_pipeline.registration.sliding import are_steps, may_slide
 from hodge_pipeline.scene import Drift
 from hodge_pipeline.types import Edges, Ints
 from hodge_pipeline.types.edges import HELD_OUT, REGISTERED, REJECTED, USED
@@ -58,7 +58,7 @@ class Acceptance:
         Steps of frames that are `in_order` may slide: they stay at their guess.
         """
         out = np.full(len(registered.pairs), "", "U64")
-        slides = may_slide(registered, self.min_spread) & ~(in_order & consecutive(registered))
+        slides = may_slide(registered, self.min_spread) & ~(in_order & are_steps(registered))
         out[slides] = "what they share lets them slide"
         out[is_refuted(registered, self.max_seen_through)] = SEEN_THROUGH
         if self.max_rmse_m is not None:

@@ -14,8 +14,8 @@ where GICP slides by whole steps of 1.4 m, the weakest direction has 0.018 to 0.
 
 
 def unheld_steps(edges: Edges, min_spread: float) -> Bools:
-    """Where (P,) consecutive frames leave a direction of translation unconstrained, as before a bare wall."""
-    return may_slide(edges, HELD_SPREADS * min_spread) & consecutive(edges)
+    """Where (P,) a step between frames leaves a direction of translation unconstrained, as before a bare wall."""
+    return may_slide(edges, HELD_SPREADS * min_spread) & are_steps(edges)
 
 
 def held_where_sliding(registered: Edges, guesses: Floats, min_spread: float) -> Edges:
@@ -44,7 +44,7 @@ def weak_directions(registered: Edges, min_spread: float) -> tuple[Bools, Floats
     return np.asarray(np.maximum(values, 0.0) < min_spread * values.sum(axis=1, keepdims=True)), vectors
 
 
-def consecutive(registered: Edges) -> Bools:
-    """Where (P,) a pair is of two frames that follow each other, among those that any pair has."""
+def are_steps(registered: Edges) -> Bools:
+    """Where (P,) a pair is a step: of two frames that follow each other, among those that any pair has."""
     rank = np.searchsorted(np.unique(registered.pairs), registered.pairs)
     return np.asarray(np.abs(rank[:, 0] - rank[:, 1]) == 1)

@@ -23,9 +23,8 @@ from hodge_pipeline.solvers.backbone.trust import SEQUENTIAL
 from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers, no_progress
 from hodge_pipeline.start.unordered.folds import Pieces, laid_apart, unfolded
 from hodge_pipeline.start.unordered.hypotheses import AMBIGUOUS, weigh
-from hodge_pipeline.start.unordered.mirrored import mirrored_scans
 from hodge_pipeline.start.unordered.options import GlobalStart
-from hodge_pipeline.start.unordered.scan_checks import check_scans
+from hodge_pipeline.start.unordered.scan_checks import check_scans, mirrored_scans
 from hodge_pipeline.start.unordered.views import Views
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Ints, ViewGraph
 from hodge_pipeline.types.edges import REJECTED
