@@ -12,6 +12,7 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 NEARLY_ORTHONORMAL = 1e-12
+"""Rounding leaves 1e-15; rotations nearer than this stay as they are, to the last bit."""
 NO_EDGES = "no edge joins two vertices: every pose is as it was at the start"
 
 

@@ -21,6 +21,7 @@ MOST_BODIES_JOINTLY = 300
 MOST_POINTS_AT_ONCE = 16384
 """Whose part of the joint normal matrix is in memory at once."""
 STEP = 1e-6
+"""Of the depth: central differences then err by 1e-10, by rounding."""
 LEAST_DISTANCE = 1e-4
 """Share of the median distance of points from cameras. A nearer one, as a robust loss leaves on a camera's centre,
 weighs 1e8 times as much: what is left of it once it is eliminated is rounding."""
