@@ -30,9 +30,8 @@ from hodge_pipeline.start.unordered.hypotheses import (
     allowed_hue_conflict,
     allowed_violation,
 )
-from hodge_pipeline.start.unordered.mirrored import mirrored_scans
 from hodge_pipeline.start.unordered.options import GlobalStart, HypothesisLimits
-from hodge_pipeline.start.unordered.scan_checks import check_scans, unregistrable
+from hodge_pipeline.start.unordered.scan_checks import check_scans, mirrored_scans, unregistrable
 from hodge_pipeline.start.unordered.start import Frames, Start, _ambiguous_pairs, _none_joined, find_start
 from hodge_pipeline.start.unordered.tour import propose_along_tour, tour
 from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, PointCloud, Source, ViewGraph

@@ -38,7 +38,7 @@ def document(report: Report, folder: str) -> Document:
         (
             Section("The place that changed most", of, pictures=pictures.changed_most, is_large=True),
             Section("What else to look at", lines=tuple(worrying[FIRST:])),
-            Section("Errors and graph", of, pictures=draw(report)),
+            Section("Errors and graph", of, pictures=tuple(draw(report))),
             *(Section.of(table) for table in score_tables(report)),
             Section(
                 "The scene from four sides",

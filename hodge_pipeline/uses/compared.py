@@ -267,7 +267,7 @@ def _page(comparison: Comparison, models: tuple[Model | None, Model | None]) -> 
             Section.of(replace(measured, rows=numbers)),
             Section.of(options),
             Section("The models from four sides", f"Left: {a}. Right: {b}.", pictures=_sides(comparison, models)),
-            Section("Trajectories", pictures=draw(_paths(comparison))),
+            Section("Trajectories", pictures=tuple(draw(_paths(comparison)))),
         ),
     )
 
