@@ -17,27 +17,6 @@ from hodge_pipeline.types import Priors, ViewGraph
 from solver_graphs import ladder
 
 
-def test_components_keep_their_own_gauge():
-    graph, truth = ladder(0.0)
-    apart = dataclasses.replace(
-        ViewGraph.from_edges(
-            np.arange(25),
-            np.concatenate([graph.edges, graph.edges + 12]),
-            np.concatenate([graph.i_from_j] * 2),
-            np.concatenate([graph.information] * 2),
-        )
-    )
-    far = se3.exp(np.array([0.1, 0.2, 0.3, 50, 0, 0]))
-    start = np.concatenate([truth, far @ truth, far[None]])
-    start[1:12] = start[13:24] = np.eye(4)
-    solution = solve(apart, start=start)
-    np.testing.assert_allclose(solution.world_from_cam[:12], truth, atol=1e-6)
-    np.testing.assert_allclose(solution.world_from_cam[12:24], far @ truth, atol=1e-6)
-    np.testing.assert_allclose(solution.world_from_cam[24], far, atol=1e-14)
-    assert solution.component.tolist() == [0] * 12 + [1] * 12 + [2]
-    assert any("3 pieces" in note for note in solution.notes)
-
-
 def test_fixed_vertices_stay():
     graph, truth = ladder(0.1)
     fixed = np.array([0, 5, 11])

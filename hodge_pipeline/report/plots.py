@@ -80,14 +80,11 @@ def _style(report: Report, name: str) -> dict[str, Any]:
     fixed = {report.before: 1, report.after: 2}
     if name in fixed:
         return STYLES[fixed[name]]
-    others = [other for other in _names(report) if other not in fixed]
+    scored = () if report.scores is None else report.scores.names
+    names = dict.fromkeys((*(path.name for path in report.pictures.paths), *scored))
+    others = [other for other in names if other not in fixed]
     free = (0, 3, 4, 5)
     return STYLES[free[others.index(name) % len(free)]] if name in others else STYLES[0]
-
-
-def _names(report: Report) -> list[str]:
-    scored = () if report.scores is None else report.scores.names
-    return list(dict.fromkeys((*(path.name for path in report.pictures.paths), *scored)))
 
 
 def _paths(figure: Figure, report: Report) -> None:

@@ -99,19 +99,11 @@ def fixes_of(positions: Positions, options: PositionOptions, scene: Scene, steps
 def _rows_by_name(names: Words, frames: Sequence[Frame]) -> Ints:
     """The row of the frame that each name means, -1 for none: by its id, its file's name, or its number."""
     rows: dict[str, int] = {}
-    spellings = (str, _file, _stem, _number)
+    spellings = (str, lambda name: PurePath(name).name, lambda name: PurePath(name).stem, _number)
     for spelling in reversed(spellings):  # the most exact one last: it wins
         rows |= {spelling(str(frame.frame_id)): row for row, frame in enumerate(frames)}
     found = (next((rows[key(name)] for key in spellings if key(name) in rows), -1) for name in names.tolist())
     return np.array(list(found), np.int64)
-
-
-def _file(name: str) -> str:
-    return PurePath(name).name
-
-
-def _stem(name: str) -> str:
-    return PurePath(name).stem
 
 
 def _number(name: str) -> str:
