@@ -10,7 +10,7 @@ from PIL import Image
 from rerun.chunk import RrdReader
 
 from hodge_pipeline.errors import WorkspaceError
-from hodge_pipeline.recording import binary, layout, shapes, stream
+from hodge_pipeline.recording import layout, live, shapes, stream
 from hodge_pipeline.recording.eye import look_at
 from hodge_pipeline.recording.merge import contents_of, find_parts
 from hodge_pipeline.types import CloudSet
@@ -20,7 +20,7 @@ from tools.recording_pictures import picture
 
 
 def verify(path: Path, scratch: Path) -> None:
-    binary.run(["rrd", "verify", str(path)], binary.quiet_environment(scratch))
+    live.run_program(["rrd", "verify", str(path)], live.quiet_environment(scratch))
 
 
 def test_one_verified_file_with_a_blueprint(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from PIL import Image
 from rerun.experimental import ViewerClient
 
 from hodge_pipeline.errors import WorkspaceError
-from hodge_pipeline.recording import binary, layout
+from hodge_pipeline.recording import layout, live
 from hodge_pipeline.recording.live import HOST, free_port
 from hodge_pipeline.recording.merge import find_parts, merge
 
@@ -53,8 +53,8 @@ def picture(recording: Path, png: Path, *, story_s: float | None = None, wait_s:
     with tempfile.TemporaryDirectory(prefix="hodge-picture-") as scratch:
         port = free_port(0)
         options = ["--headless", "--bind", HOST, "--port", str(port), "--window-size", WINDOW]
-        environment, nowhere = binary.quiet_environment(Path(scratch)), subprocess.DEVNULL
-        command = [str(binary.program()), *options]
+        environment, nowhere = live.quiet_environment(Path(scratch)), subprocess.DEVNULL
+        command = [str(live.program()), *options]
         with subprocess.Popen(command, env=environment, stdout=nowhere, stderr=nowhere) as viewer:
             try:
                 client = _connect(port, viewer)

@@ -14,7 +14,7 @@ from hodge_adapters.colmap.points import error_cap, reprojection_errors
 from hodge_adapters.colmap.records import Model
 from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, Floats, Ints
-from hodge_pipeline.types.pose_information import GAUGE, PoseInformation
+from hodge_pipeline.types.tracked_model import GAUGE, PoseInformation
 
 MOST_BODIES_JOINTLY = 300
 """Above it the joint covariance (6 B)² costs too much: each body is then taken given all others, which is too sure."""
