@@ -27,7 +27,7 @@ from hodge_pipeline.demo.street import Road
 from hodge_pipeline.demo.sweeps import FARTHEST_M, NEAREST_M, REVOLUTION_S, StreetOptions
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.recipe.schema import load_recipe
-from hodge_pipeline.start.choose_key_frames import choose_key_frames
+from hodge_pipeline.scene import choose_key_frames
 from hodge_pipeline.start.sweeps import KEY_FRAMES_IN_REACH
 from hodge_pipeline.types import Floats, Ints
 from hodge_pipeline.types.edges import USED

@@ -98,7 +98,7 @@ def main(folder: Path) -> None:
     rows = np.array([row for row in found.rows if found.subject.graph.source[row] != "sequential"][:1])
     (edge,) = edge_pictures(found.subject.graph, found.diagnosis, rows, found.subject.frames, found.subject.clouds)
     stacked(PICTURES / "which-edge-wrong.jpg", [plot.image for plot in edge.plots])
-    matrix, above, *_ = draw(found.subject.graph, found.diagnosis, ())
+    matrix, above = draw(found.subject.graph, found.diagnosis, (), has_metres=True)
     (PICTURES / "which-edge-matrix.png").write_bytes(matrix.image)
     (PICTURES / "which-edge-above.png").write_bytes(above.image)
 

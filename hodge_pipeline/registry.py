@@ -131,11 +131,13 @@ def name_of(stage: object) -> str:
 def name_of_class(cls: type) -> str:
     """The registered name of a stage, else its `module:Class`."""
     path = f"{cls.__module__}:{cls.__qualname__}"
+    return next((name for _, name in _registered_as(path)), path)
+
+
+def _registered_as(path: str) -> Iterator[tuple[str, str]]:
+    """Kind and name of each entry point of this `module:Class`."""
     for kind in KINDS.values():
-        for name, entry in _entries(kind.group).items():
-            if entry.value == path:
-                return name
-    return path
+        yield from ((kind.name, name) for name, entry in _entries(kind.group).items() if entry.value == path)
 
 
 @contextmanager
@@ -171,9 +173,5 @@ def _plugin_in(error: Exception) -> str | None:
 
 
 def _plugin_of(cls: type) -> str | None:
-    path = f"{cls.__module__}:{cls.__qualname__}"
-    for kind in KINDS.values():
-        for name, entry in _entries(kind.group).items():
-            if entry.value == path and not origin(kind.name, name).startswith(OURS):
-                return f"{name} ({origin(kind.name, name)})"
-    return None
+    known = ((name, origin(kind, name)) for kind, name in _registered_as(f"{cls.__module__}:{cls.__qualname__}"))
+    return next((f"{name} ({package})" for name, package in known if not package.startswith(OURS)), None)

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
+from pydantic import ConfigDict
+
 from hodge_pipeline.scene import Scene
 from hodge_pipeline.types import (
     CloudSet,
@@ -32,6 +34,8 @@ from hodge_pipeline.types.tracked_model import TrackedModel
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
+"""Of options some of which are stages: an unknown one is refused."""
 Advance = Callable[[int], None]
 """Called with the number of units just finished; a stage's one duty towards a progress bar. Negative where they are
 done again."""

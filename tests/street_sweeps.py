@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import pickle
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -51,8 +50,8 @@ def once(what: Callable[..., object]) -> Callable[..., object]:
     return answer
 
 
-@contextmanager
-def warmed_up_once() -> Iterator[None]:
+@pytest.fixture(scope="module", autouse=True)
+def warm_up_once() -> Iterator[None]:
     """What the first of the same sweeps tell is found once, times are judged only in tests of that: both are most of
     what following so few sweeps costs.
     """

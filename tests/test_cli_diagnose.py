@@ -4,6 +4,7 @@ import csv
 import json
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from typer.testing import CliRunner
 import hodge_pipeline
 from backbone_graphs import drive
 from betti import betti_numbers
+from command import told
 from hodge_adapters.pose_graphs.g2o import write_g2o
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_pipeline import se3
@@ -57,10 +59,7 @@ def spoil(graph: ViewGraph, row: int) -> None:
     graph.i_from_j[row] = graph.i_from_j[row] @ se3.exp(np.array([0.5, 0.2, -0.4, 0.6, -0.5, 0.3]))
 
 
-def hodge(*arguments: object) -> str:
-    done = CliRunner().invoke(app, ["diagnose", *map(str, arguments)], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-    return done.stdout
+hodge = partial(told, "diagnose")
 
 
 @pytest.fixture(scope="module")

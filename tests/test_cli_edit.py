@@ -1,17 +1,16 @@
 """`hodge edit`, and `hodge solve` on the run folder: edits, their history, and resume."""
 
-import csv
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import hodge_pipeline
+from command import rows_of
+from command import told as hodge
 from hodge_adapters.pose_graphs.g2o import write_g2o
 from hodge_pipeline import se3
-from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import GraphError, HodgeError, WorkspaceError
 from hodge_pipeline.pairs.edits import Edit, History, read_history, write_history
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
@@ -33,20 +32,9 @@ def small_recipe(source: Path) -> Recipe:
     return load_recipe("demo", SMALL, source)
 
 
-def hodge(*arguments: object) -> str:
-    done = CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-    return done.stdout
-
-
 @pytest.fixture(scope="module")
 def run(tiny_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:  # noqa: F811
     return hodge_pipeline.run(small_recipe(tiny_sequence), tmp_path_factory.mktemp("runs") / "tiny")
-
-
-def rows_of(folder: Path) -> list[dict[str, str]]:
-    with (folder / "edges.csv").open() as file:
-        return list(csv.DictReader(file))
 
 
 def statuses(folder: Path) -> dict[str, str]:

@@ -19,7 +19,6 @@ from hodge_pipeline.pairs.centroid import CentroidEdges
 from hodge_pipeline.pairs.combined import CombinedEdges
 from hodge_pipeline.pairs.overlap import FRAMES_OF_A_PLACE, OverlapEdges, pairwise_iou, some_of_each_place
 from hodge_pipeline.pairs.sequential import SequentialEdges
-from hodge_pipeline.stages import EdgeBuilder
 from hodge_pipeline.types import CloudSet, Edges, Frame, PointCloud
 
 
@@ -127,14 +126,6 @@ def test_overlap_far_from_the_origin_works_and_diverged_poses_are_named() -> Non
     assert as_list(OverlapEdges().propose(frames_of(*"aa"), clouds_of(POINT, POINT), utm)) == [(0, 1)]
     with pytest.raises(GraphError, match="diverged"):
         OverlapEdges().propose(frames_of(*"aa"), clouds_of(POINT, POINT), poses_at(0, 5e6))
-
-
-@pytest.mark.parametrize("builder", [SequentialEdges(), CentroidEdges(), OverlapEdges()])
-@pytest.mark.parametrize("count", [0, 1])
-def test_nothing_gives_no_pairs(builder: EdgeBuilder, count: int) -> None:
-    for clouds in (clouds_of(*[POINT] * count), clouds_of(*[[]] * count)):
-        found = builder.propose(frames_of(*"a" * count), clouds, poses_at(*[0] * count))
-        assert found.pairs.shape == (0, 2) and found.pairs.dtype == np.int64 and len(found.overlap) == 0
 
 
 LINE = poses_at(0, 0.1, 0.2, 3.0, 0.0)

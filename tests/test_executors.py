@@ -8,6 +8,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,12 @@ import numpy as np
 import psutil
 import pytest
 
-from hodge_pipeline.errors import SourceError, WorkerError
+from hodge_pipeline.errors import WorkerError
 from hodge_pipeline.executors import local
 from hodge_pipeline.executors.dask import cluster_workers
 from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.stages import Workers
+from hodge_pipeline.testing import check_executor
 
 PATIENCE_S = 600
 """No result depends on it: it only keeps a child that hangs from holding the tests for ever."""
@@ -58,21 +60,6 @@ def has_mallinfo2() -> bool:
         return hasattr(ctypes.CDLL(None), "mallinfo2")
     except TypeError:
         return False
-
-
-def fail_on_three(number: int) -> int:
-    if number == 3:
-        raise SourceError("frame 3: truncated: copy it again")
-    return number
-
-
-def die_once(folder: Path, number: int) -> int:
-    """Kill this worker the first time that block 2 is seen."""
-    mark = folder / "died"
-    if number == 2 and not mark.exists():
-        mark.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number
 
 
 def die_always(number: int) -> int:
@@ -120,29 +107,17 @@ def opened() -> Iterator[Opened]:
         yield open_workers
 
 
-@pytest.fixture(params=["in process", "spawned", "dask"])
-def workers(request: pytest.FixtureRequest, opened: Opened) -> Iterator[Workers]:
-    with opened(request.param) as found:
-        yield found
+@dataclass(frozen=True)
+class Opening:
+    """What opens as an executor does."""
+
+    open: Callable[[], AbstractContextManager[Workers]]
 
 
-def test_every_block_comes_back_once_and_workers_serve_again(workers: Workers) -> None:
-    assert sorted(workers.map(square, range(7))) == [(k, k * k) for k in range(7)]
-    assert sorted(workers.map(square, [])) == []
-    assert sorted(workers.map(square, [5])) == [(0, 25)]
-
-
-def test_an_error_in_a_task_is_raised_here(workers: Workers) -> None:
-    with pytest.raises(SourceError, match="frame 3"):
-        list(workers.map(fail_on_three, range(6)))
-
-
-@pytest.mark.parametrize("name", ["spawned", "dask"])
-def test_a_worker_that_dies_costs_a_retry(name: str, opened: Opened, tmp_path: Path) -> None:
-    with opened(name) as workers:
-        results = sorted(workers.map(partial(die_once, tmp_path), range(8)))
-    assert results == [(k, k) for k in range(8)]
-    assert (tmp_path / "died").exists()
+@pytest.mark.parametrize("what", check_executor.promises)
+@pytest.mark.parametrize("name", ["in process", "spawned", "dask"])
+def test_all_workers_keep_the_contract(name: str, what: str, opened: Opened) -> None:
+    check_executor(Opening(partial(opened, name)), properties=[what])
 
 
 @pytest.mark.parametrize(("name", "line"), [("spawned", "block 1 lost its"), ("dask", r"block \d lost its Dask")])

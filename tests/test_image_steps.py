@@ -14,7 +14,7 @@ import hodge_pipeline
 from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
-from hodge_pipeline.refine.image_steps import step_errors_m
+from hodge_pipeline.refine.against_images import step_errors_m
 from hodge_pipeline.stages import Step
 from hodge_pipeline.types import Floats32, Source
 

@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 
 from hodge_adapters.trajectories.readers import TumPosesReader
 from hodge_adapters.trajectories.rewriting import TumRewriter
-from hodge_adapters.trajectories.text import KittiWriter, TumWriter, parse_tum, read_kitti, write_kitti, write_tum
+from hodge_adapters.trajectories.text import parse_tum, read_kitti, write_kitti, write_tum
 from hodge_pipeline import se3
-from hodge_pipeline.errors import SourceError, WorkspaceError
+from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guess_reader
-from hodge_pipeline.stages import Writer
-from hodge_pipeline.types import Source, Trajectory
+from hodge_pipeline.types import Trajectory
 
 IDENTITY = "0 0 0 0 0 0 1"
 
@@ -73,23 +72,6 @@ def test_a_quarter_turn_by_hand(tmp_path: Path) -> None:
     expected = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
     np.testing.assert_allclose(found.world_from_cam, [expected], atol=1e-15)
     assert found.stamps_s.tolist() == [5.5]
-
-
-def test_the_writers_are_stages(tmp_path: Path) -> None:
-    for writer in (TumWriter(), KittiWriter()):
-        assert isinstance(writer, Writer)
-        source = Source("poses", tmp_path, trajectory=trajectory(3, 0))
-        writer.write(tmp_path / "poses", source)
-        first = (tmp_path / "poses").read_bytes()
-        writer.write(tmp_path / "poses", source)
-        assert (tmp_path / "poses").read_bytes() == first
-        with pytest.raises(SourceError, match="no poses to write"):
-            writer.write(tmp_path / "poses", Source("empty", tmp_path))
-
-
-def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(WorkspaceError, match="nowhere"):
-        write_tum(tmp_path / "nowhere" / "poses.tum", trajectory(1, 0))
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from hodge_adapters.association import nearest_pairs
 from hodge_adapters.images.camera_files import resized
 from hodge_adapters.tum import reader
 from hodge_adapters.tum.image_lists import StampedImages, read_pairs
@@ -17,7 +14,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.start.key_frames import is_video
 from hodge_pipeline.testing import check_reader
-from hodge_pipeline.types import Camera, Source, Trajectory
+from hodge_pipeline.types import Camera, Source
 from readers_data import HEIGHT, WIDTH, agreement, depth_values, linked, some_poses, tum_folder, tum_line, write_depth
 
 
@@ -276,23 +273,6 @@ def test_truth_by_row(folder: Path) -> None:
         TumReader(truth="gone.txt").open(folder)
 
 
-@given(
-    depth=st.lists(st.integers(0, 400), unique=True, max_size=40).map(sorted),
-    colour=st.lists(st.integers(0, 400), unique=True, max_size=40).map(sorted),
-)
-@settings(deadline=None)
-def test_pairs_are_near_unique_and_none_is_missed(depth: list[int], colour: list[int]) -> None:
-    depth_s, colour_s = np.array(depth) / 100, np.array(colour) / 100
-    pairs = nearest_pairs(depth_s, colour_s, 0.0201)
-    found = [(row, column) for row, column in enumerate(pairs.tolist()) if column >= 0]
-    assert len({column for _, column in found}) == len(found)
-    assert all(abs(depth[row] - colour[column]) <= 2 for row, column in found)
-    # A pair left over on both sides would be one that the greedy choice should have made.
-    free_depth = {row for row, column in enumerate(pairs) if column < 0}
-    free_colour = set(range(len(colour))) - {column for _, column in found}
-    assert not any(abs(depth[row] - colour[column]) <= 2 for row in free_depth for column in free_colour)
-
-
 @pytest.mark.parametrize(
     ("depth", "colour", "delay_s"),
     [
@@ -312,26 +292,6 @@ def test_copies_are_paired_by_the_stamp_of_the_first(tmp_path: Path, depth: str,
     found = read_pairs(tmp_path, 0.02, notes := [])
     assert [path and path.read_text() for path in found.colour] == list(colour)
     assert np.allclose(found.colour_delays_s, delay_s, atol=1e-5) and notes == []
-
-
-def test_the_nearer_depth_gets_the_colour_image() -> None:
-    assert nearest_pairs(np.array([1.0, 1.01]), np.array([1.012]), 0.02).tolist() == [-1, 0]
-
-
-def test_outside_the_trajectory_there_is_no_pose() -> None:
-    trajectory = Trajectory(np.array([1.0, 2.0]), some_poses(2))
-    poses = se3.poses_at(trajectory, np.array([0.99, 1.0, 1.5, 2.0, 2.01]), 1.0)
-    assert np.isnan(poses[:, 0, 0]).tolist() == [True, False, False, False, True]
-    np.testing.assert_allclose(poses[[1, 3]], trajectory.world_from_cam, atol=1e-12)
-
-
-def test_a_pose_at_a_frames_own_stamp_is_its_truth_however_sparse_the_truth_is() -> None:
-    trajectory = Trajectory(np.array([1.0, 2.0, 3.0]), some_poses(3))
-    stamps_s = np.array([1.01, 1.5, 1.985, 3.01])
-    poses = se3.poses_at(trajectory, stamps_s, 0.1, 0.02)
-    assert np.isnan(poses[:, 0, 0]).tolist() == [False, True, False, True]
-    dense = se3.poses_at(trajectory, stamps_s[[0, 2]], 1.0)
-    np.testing.assert_array_equal(poses[[0, 2]], dense)
 
 
 def test_the_largest_value_is_no_depth(tmp_path: Path) -> None:

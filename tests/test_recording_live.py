@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from hodge_pipeline.errors import WorkspaceError
-from hodge_pipeline.recording import binary, layout, live
+from hodge_pipeline.recording import layout, live
 from hodge_pipeline.recording.merge import find_parts
 from recording_data import circle, record, record_all, rows
 from test_recording_run import entities
@@ -22,7 +22,7 @@ def merged_when_it_holds(wanted: set[str], saved: Path) -> Path:
     mended = saved.with_name("mended.rrd")
     merge = ["rrd", "merge", "--continue-on-error", str(saved), "-o", str(mended)]
     for _ in range(TRIES):
-        binary.run(merge, binary.quiet_environment(saved.parent))
+        live.run_program(merge, live.quiet_environment(saved.parent))
         if entities(mended) >= wanted:
             return mended
         time.sleep(0.5)
@@ -32,7 +32,7 @@ def merged_when_it_holds(wanted: set[str], saved: Path) -> Path:
 def test_a_viewer_gets_each_part_once(tmp_path: Path) -> None:
     port, saved = live.free_port(0), tmp_path / "saved.rrd"
     flags = ["--bind", live.HOST, "--port", str(port), "--save", str(saved)]
-    listener = live.start(flags, binary.quiet_environment(tmp_path))
+    listener = live.start(flags, live.quiet_environment(tmp_path))
     try:
         live.wait_for(port, listener)
         shown = live.Live(f"rerun+http://{live.HOST}:{port}/proxy", "run-1")
@@ -62,7 +62,7 @@ def test_a_recording_is_served_on_this_machine_alone(tmp_path: Path) -> None:
 
 
 def test_a_viewer_that_does_not_start_is_one_line(tmp_path: Path) -> None:
-    ended = live.start(["--no-such-flag"], binary.quiet_environment(tmp_path))
+    ended = live.start(["--no-such-flag"], live.quiet_environment(tmp_path))
     ended.wait()
     with pytest.raises(WorkspaceError, match="does not start"):
         live.wait_for(live.free_port(0), ended)

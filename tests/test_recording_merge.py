@@ -10,16 +10,17 @@ from PIL import Image
 from rerun.chunk import RrdReader
 
 from hodge_pipeline.errors import WorkspaceError
-from hodge_pipeline.recording import binary, layout, shapes, stream
+from hodge_pipeline.recording import layout, live, shapes, stream
 from hodge_pipeline.recording.eye import look_at
 from hodge_pipeline.recording.merge import contents_of, find_parts
 from hodge_pipeline.types import CloudSet
 from recording_data import circle, make_frames, record, record_all, rows
+from tools import recording_pictures
 from tools.recording_pictures import picture
 
 
 def verify(path: Path, scratch: Path) -> None:
-    binary.run(["rrd", "verify", str(path)], binary.quiet_environment(scratch))
+    live.run_program(["rrd", "verify", str(path)], live.quiet_environment(scratch))
 
 
 def test_one_verified_file_with_a_blueprint(tmp_path: Path) -> None:
@@ -33,6 +34,31 @@ def test_one_verified_file_with_a_blueprint(tmp_path: Path) -> None:
     assert [entry.recording_id for entry in reader.recordings()] == ["run-1"]
     assert len(reader.blueprints()) == 1
     assert not list(tmp_path.rglob(".*"))
+
+
+def opened_tab(recording: Path) -> str:
+    """The name of the tab that a recording opens on."""
+    reader = RrdReader(recording)
+    batches = [chunk.to_record_batch() for chunk in reader.stream(store=reader.blueprints()[0])]
+    columns = [{name.split(":")[-1]: batch[name] for name in batch.schema.names} for batch in batches]
+    paths = [batch.schema.metadata[b"rerun:entity_path"].decode() for batch in batches]
+    (tab,) = (column["active_tab"][0][0].as_py() for column in columns if "active_tab" in column)
+    names = dict(zip(paths, columns, strict=True))
+    return str(names[f"/{tab}"]["display_name"][0][0].as_py())
+
+
+def test_pictures_of_tabs_are_of_recordings_that_open_on_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    record_all(record(tmp_path / "run" / "stages" / "record_all"))
+    opened = {}
+
+    def paint(recording: Path, png: Path, wait_s: float) -> None:
+        opened[recording.stem] = opened_tab(recording)
+        Image.new("RGB", (100, 50)).save(png)
+
+    monkeypatch.setattr(recording_pictures, "picture", paint)
+    recording_pictures.draw(tmp_path / "run", tmp_path / "out", ("story", "solver"))
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"recording-story.png", "recording-solver.png"}
+    assert opened == {"story": "Story", "solver": "Edges and solver"}
 
 
 def test_the_camera_moves_along_the_best_trajectory(tmp_path: Path) -> None:

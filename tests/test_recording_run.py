@@ -18,7 +18,7 @@ from fresh_process import run_fresh
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import main
 from hodge_pipeline.errors import HodgeError, SourceError, WorkspaceError
-from hodge_pipeline.recording import binary, layout, shapes
+from hodge_pipeline.recording import layout, live, shapes
 from hodge_pipeline.registration.register import register_edges
 from hodge_pipeline.rounds.one_round import Work
 from hodge_pipeline.run_folder import Run
@@ -37,7 +37,7 @@ NORMAL = ("recording.level=normal",)
 
 
 def verify(path: Path, scratch: Path) -> None:
-    binary.run(["rrd", "verify", str(path)], binary.quiet_environment(scratch))
+    live.run_program(["rrd", "verify", str(path)], live.quiet_environment(scratch))
 
 
 def entities(path: Path) -> set[str]:
@@ -113,7 +113,7 @@ def test_a_killed_run_is_recorded_from_its_folder(run: Run, tmp_path: Path) -> N
     parts = [str(path) for path in sorted((folder / "stages").glob("record_*/*.rrd"))]
     mended = str(tmp_path / "mended.rrd")
     merge = ["rrd", "merge", "--continue-on-error", *parts, "-o", mended]
-    binary.run(merge, binary.quiet_environment(tmp_path))
+    live.run_program(merge, live.quiet_environment(tmp_path))
     verify(Path(mended), tmp_path)
     path, is_whole = record_again(folder, {})
     assert not is_whole

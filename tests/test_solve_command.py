@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from typer.testing import CliRunner
 
 import hodge_pipeline
 from backbone_graphs import drive
+from command import told
 from hodge_adapters.pose_graphs.g2o import load_g2o, write_g2o
 from hodge_pipeline import se3
 from hodge_pipeline.cli.main import app
@@ -39,10 +41,7 @@ def graph_file(path: Path, planar: bool = False) -> ViewGraph:
     return graph
 
 
-def hodge(*arguments: object) -> str:
-    done = CliRunner().invoke(app, ["solve", *map(str, arguments)], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-    return done.stdout
+hodge = partial(told, "solve")
 
 
 @pytest.mark.parametrize("planar", [False, True])

@@ -11,7 +11,6 @@ from hodge_pipeline.diagnosis.robust import RobustSolver, solve_robust
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.covariance import marginal_covariances, relative_covariances
 from hodge_pipeline.solvers.maximum_likelihood import MaximumLikelihoodSolver, solve
-from hodge_pipeline.stages import ConsistencySolver
 from hodge_pipeline.types import Priors, ViewGraph
 
 SIGMA_RAD, SIGMA_M = 0.01, 0.02
@@ -145,12 +144,6 @@ def test_what_only_wrong_edges_join_falls_apart():
     assert np.isfinite(solution.world_from_cam).all()
     assert (solution.weights[-3:] > 0).sum() <= 1
     assert (solution.weights[:-3] > 0).mean() > 0.9
-
-
-def test_the_stage_keeps_its_protocol():
-    graph, truth = band(8, 3, 8)
-    assert isinstance(RobustSolver(), ConsistencySolver)
-    np.testing.assert_allclose(RobustSolver().solve(graph, truth).world_from_cam[0], truth[0], atol=1e-12)
 
 
 def test_the_covariance_of_a_chain_adds_up():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.sources.lacking import check_measurable, lacking
+from hodge_pipeline.sources.opening import check_measurable, lacking
 from hodge_pipeline.types import Camera, Frame, Source, Trajectory
 
 POSED = Frame(

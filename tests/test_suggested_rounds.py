@@ -1,15 +1,14 @@
 """Suggested pairs registered: by the recipe, round after round, and by hand with `hodge edit --register`."""
 
-import csv
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import hodge_pipeline
-from hodge_pipeline.cli.main import app
+from command import rows_of
+from command import told as hodge
 from hodge_pipeline.errors import GraphError, WorkspaceError
 from hodge_pipeline.recipe.schema import Recipe, load_recipe
 from hodge_pipeline.run_folder import Run
@@ -24,17 +23,6 @@ CHAIN = (
 
 def chain(source: Path, *overrides: str) -> Recipe:
     return load_recipe("demo", [*CHAIN, *overrides], source)
-
-
-def hodge(*arguments: object) -> str:
-    done = CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-    return done.stdout
-
-
-def rows_of(folder: Path) -> list[dict[str, str]]:
-    with (folder / "edges.csv").open() as file:
-        return list(csv.DictReader(file))
 
 
 @pytest.fixture(scope="module")

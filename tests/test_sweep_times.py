@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -49,17 +48,11 @@ from street_sweeps import (
     street_followed,
     true_at,
     true_poses,
-    warmed_up_once,
+    warm_up_once,  # noqa: F401 - a fixture
     without_order,
 )
 
 FAST, FAST_M_S = 24, 20.0
-
-
-@pytest.fixture(scope="module", autouse=True)
-def warm_up_once() -> Iterator[None]:
-    with warmed_up_once():
-        yield
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -38,15 +38,9 @@ from street_sweeps import (
     street_followed,
     true_at,
     true_poses,
-    warmed_up_once,
+    warm_up_once,  # noqa: F401 - a fixture
     without_order,
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def warm_up_once() -> Iterator[None]:
-    with warmed_up_once():
-        yield
 
 
 def broken(cloud: PointCloud) -> PointCloud:

@@ -20,7 +20,7 @@ from hodge_pipeline.registration.colour_evidence import hue_conflicts
 from hodge_pipeline.registration.global_evidence import DepthView
 from hodge_pipeline.stages import Step, no_progress
 from hodge_pipeline.start.clouds import clouds as make_clouds
-from hodge_pipeline.start.unordered.folds import Pieces, contradictions, unfolded, within_parts
+from hodge_pipeline.start.unordered.folds import Pieces, contradictions, laid_apart, unfolded, within_parts
 from hodge_pipeline.start.unordered.hypotheses import (
     AMBIGUOUS,
     LEAST_HUE_CONFLICT,
@@ -30,10 +30,8 @@ from hodge_pipeline.start.unordered.hypotheses import (
     allowed_hue_conflict,
     allowed_violation,
 )
-from hodge_pipeline.start.unordered.mirrored import mirrored_scans
 from hodge_pipeline.start.unordered.options import GlobalStart, HypothesisLimits
-from hodge_pipeline.start.unordered.pieces import laid_apart
-from hodge_pipeline.start.unordered.scan_checks import check_scans, unregistrable
+from hodge_pipeline.start.unordered.scan_checks import check_scans, mirrored_scans, unregistrable
 from hodge_pipeline.start.unordered.start import Frames, Start, _ambiguous_pairs, _none_joined, find_start
 from hodge_pipeline.start.unordered.tour import propose_along_tour, tour
 from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, PointCloud, Source, ViewGraph

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, get_args, get_type_hints
 
 from hodge_pipeline import registry
@@ -56,28 +57,49 @@ def _sections() -> Iterator[str]:
 def _stages() -> Iterator[str]:
     for kind in registry.KINDS.values():
         names = [name for name in registry.names(kind.name) if registry.origin(kind.name, name).startswith(OURS)]
-        if names:
-            yield f"## Stages: {kind.name}\n"
-            yield f"They {kind.summary}.\n" if not kind.summary.startswith(("where", "what")) else f"{kind.summary}.\n"
-        for name in names:
-            yield f"### `{name}`\n"
-            try:
-                stage = registry.load(kind.name, name)
-            except HodgeError as error:
-                yield f"Does not load here: {error}\n"
-                continue
-            yield f"{_first_line(stage)}\n"
-            yield from _table(stage)
+        if not names:
+            continue
+        yield f"## Stages: {kind.name}\n"
+        yield f"They {kind.summary}.\n" if not kind.summary.startswith(("where", "what")) else f"{kind.summary}.\n"
+        stages = {name: _loaded(kind.name, name) for name in names}
+        plain = {name: stage for name, stage in stages.items() if not _fields(stage)}
+        if plain:
+            yield "| stage without options | what |\n|---|---|"
+            yield from (f"| `{name}` | {_cell(_first_line(stage))} |" for name, stage in plain.items())
+            yield ""
+        for name, stage in stages.items():
+            if name not in plain:
+                base = next((other for other in stages if other != name and stages[other] in stage.__mro__), None)
+                yield f"### `{name}`\n"
+                yield f"{_first_line(stage)}{f' Also takes the options of `{base}`.' if base else ''}\n"
+                yield from _table(stage, _fields(stages[base]) if base else {})
 
 
-def _table(cls: Any) -> Iterator[str]:
-    fields = getattr(cls, "__pydantic_fields__", {})
+def _loaded(kind: str, name: str) -> Any:
+    """The stage, or why it does not load here."""
+    try:
+        return registry.load(kind, name)
+    except HodgeError as error:
+        return f"Does not load here: {error}"
+
+
+def _fields(cls: Any) -> dict[str, Any]:
+    return getattr(cls, "__pydantic_fields__", {})
+
+
+def _table(cls: Any, told: Mapping[str, Any] = MappingProxyType({})) -> Iterator[str]:
+    """The options, but those `told` elsewhere with the same default and meaning."""
+    fields = {name: each for name, each in _fields(cls).items() if name not in told or _row(each) != _row(told[name])}
     if not fields:
         return
     yield "| option | default | what |\n|---|---|---|"
     for name, field in fields.items():
-        yield f"| `{name}` | {_default(field)} | {_cell(_meaning(field))} |"
+        yield f"| `{name}` | {_row(field)} |"
     yield ""
+
+
+def _row(field: Any) -> str:
+    return f"{_default(field)} | {_cell(_meaning(field))}"
 
 
 def _meaning(field: Any) -> str:
@@ -98,7 +120,7 @@ def _default(field: Any) -> str:
 
 
 def _first_line(cls: Any) -> str:
-    return str(cls.__doc__ or "").strip().splitlines()[0]
+    return cls if isinstance(cls, str) else str(cls.__doc__ or "").strip().splitlines()[0]
 
 
 def _cell(text: str) -> str:

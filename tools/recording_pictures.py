@@ -15,11 +15,14 @@ from PIL import Image
 from rerun.experimental import ViewerClient
 
 from hodge_pipeline.errors import WorkspaceError
-from hodge_pipeline.recording import binary, layout
+from hodge_pipeline.recording import layout, live
 from hodge_pipeline.recording.live import HOST, free_port
 from hodge_pipeline.recording.merge import find_parts, merge
 
-TABS = ("story", "frames", "registration", "complex", "solver", "model", "evaluation", "log")
+TABS = {
+    "story": "Story", "frames": "Frames", "registration": "Registration", "complex": "Complex, diagnosis",
+    "solver": "Edges and solver", "model": "Model", "evaluation": "Evaluation", "log": "Log and recipe",
+}  # fmt: skip
 WIDTH = 1000
 COLOURS = 128
 START_S = 30.0
@@ -28,13 +31,13 @@ WINDOW = "1600x900"
 
 
 def draw(run: Path, out: Path, tabs: tuple[str, ...]) -> None:
-    """Write `recording-<tab>.png` for these tabs of a run whose stages were all recorded."""
+    """Write `recording-<tab>.png` for these tabs of a run that has what they show."""
     parts = [part for folder in sorted((run / "stages").glob("record*")) for part in find_parts(folder)]
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch:
         for tab in tabs:
             recording, png = Path(scratch) / f"{tab}.rrd", out / f"recording-{tab}.png"
-            merge(parts, recording, f"picture-{tab}", active_tab=TABS.index(tab))
+            merge(parts, recording, f"picture-{tab}", TABS[tab])
             picture(recording, png, wait_s=8.0)
             with Image.open(png) as image:
                 height = round(image.height * WIDTH / image.width)
@@ -50,8 +53,8 @@ def picture(recording: Path, png: Path, *, story_s: float | None = None, wait_s:
     with tempfile.TemporaryDirectory(prefix="hodge-picture-") as scratch:
         port = free_port(0)
         options = ["--headless", "--bind", HOST, "--port", str(port), "--window-size", WINDOW]
-        environment, nowhere = binary.quiet_environment(Path(scratch)), subprocess.DEVNULL
-        command = [str(binary.program()), *options]
+        environment, nowhere = live.quiet_environment(Path(scratch)), subprocess.DEVNULL
+        command = [str(live.program()), *options]
         with subprocess.Popen(command, env=environment, stdout=nowhere, stderr=nowhere) as viewer:
             try:
                 client = _connect(port, viewer)
@@ -92,4 +95,4 @@ def _connect(port: int, viewer: subprocess.Popen[bytes]) -> ViewerClient:
 if __name__ == "__main__":
     if len(sys.argv) < 3:
         sys.exit("usage: python tools/recording_pictures.py RUN OUT [TAB …]")
-    draw(Path(sys.argv[1]), Path(sys.argv[2]), tuple(sys.argv[3:]) or TABS)
+    draw(Path(sys.argv[1]), Path(sys.argv[2]), tuple(sys.argv[3:]) or tuple(TABS))

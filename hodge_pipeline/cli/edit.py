@@ -70,14 +70,12 @@ def _checked(folder: Path, listed: Listed, pairs: Pairs) -> Edit:
     right = listed.named(_words(pairs.right))
     if both := set(off) & {*on, *right}:
         raise GraphError(f"{', '.join(sorted(both))}: is to be disabled and enabled at once: say one of them")
-    return Edit(off, on, _to_register(folder, _words(pairs.register)) if pairs.register else (), right=right)
-
-
-def _to_register(folder: Path, words: Sequence[str]) -> tuple[str, ...]:
+    if not pairs.register:
+        return Edit(off, on, right=right)
     from hodge_pipeline.run_folder import Run
 
     last = Run.load(folder).result
-    return pairs_to_register(last.edges, last.vertex_ids, words)
+    return Edit(off, on, pairs_to_register(last.edges, last.vertex_ids, _words(pairs.register)), right=right)
 
 
 def _verdicts_spelt_out(listed: Listed, words: Sequence[str]) -> list[str]:

@@ -143,7 +143,7 @@ def refine_trajectory(
     dask: str | None,
 ) -> None:
     """Run `slam_refine` on given poses and frames; `CheckError`, exit code 3, where the poses given are better."""
-    from hodge_pipeline.uses.refinement_recipe import recipe_for
+    from hodge_pipeline.uses.trajectory import recipe_for
 
     if not poses.exists():
         raise SourceError(f"{poses}: no such file or folder: give the poses to refine")

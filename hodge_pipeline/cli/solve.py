@@ -18,13 +18,12 @@ from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName
 from hodge_pipeline.solvers.newton import TIME_LIMIT_REACHED
 from hodge_pipeline.solvers.setup import InitialName
 from hodge_pipeline.store.workspace import EDITS_FILE, PAGE_FILE, RECIPE_FILE
-from hodge_pipeline.types import Source
 from hodge_pipeline.types.text import command, counted
 
 COUNTED = ("pose", "edge", "piece")
 """Counts of the summary that are printed."""
 KNOWN_ENDINGS = (".tum", ".kitti", ".csv", ".log", ".json", ".ply")
-"""Endings that tell the format. `.txt` does not: many programs name their g2o files so."""
+"""Endings that tell the format; any other is a g2o file's. `.txt` tells none: many programs name g2o files so."""
 NOTES = 2
 """Printed without `--verbose`."""
 
@@ -87,7 +86,10 @@ def solve(
         keep_source(path, out)
     with ProgressBars.of(shown) as terminal, terminal.stage("solve", 1):
         solved = solve_file(path, options)
-    left_out = () if out is None else write_solved(out, solved, _writer(out, solved.source))
+    left_out: tuple[str, ...] = ()
+    if out is not None:
+        writer = writer_name(out, solved.source) if out.suffix.lower() in KNOWN_ENDINGS else "g2o"
+        left_out = write_solved(out, solved, writer)
     if run_folder is not None:
         from hodge_pipeline.report.solved import write_run_folder
 
@@ -99,11 +101,6 @@ def solve(
     elif not shown.quiet:
         print("\n".join(_lines(solved, summary, out, run_folder, verbose=shown.verbose)))
     _check(summary, options.initial)
-
-
-def _writer(out: Path, source: Source) -> str:
-    """The writer of a result by its ending; any ending that tells no format is a g2o file's."""
-    return writer_name(out, source) if out.suffix.lower() in KNOWN_ENDINGS else "g2o"
 
 
 def _solve_run(folder: Path, shown: Shown, dask: str | None) -> None:

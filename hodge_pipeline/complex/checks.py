@@ -12,6 +12,7 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 NEARLY_ORTHONORMAL = 1e-12
+"""Rounding leaves 1e-15; rotations nearer than this stay as they are, to the last bit."""
 NO_EDGES = "no edge joins two vertices: every pose is as it was at the start"
 
 
@@ -31,7 +32,7 @@ def check_graph(graph: ViewGraph, world_from_cam: Floats | None = None) -> None:
         if given != (graph.edge_count, *shape):
             raise GraphError(f"{name} has the shape {given}, expected {(graph.edge_count, *shape)}")
     check_edges(graph.edges, count)
-    check_rows(graph.fixed, count, "fixed")
+    check_fixed(graph.fixed, count)
     if world_from_cam is not None:
         ids = graph.vertex_ids
         check_motions(world_from_cam, "poses", lambda row: f"the start pose of vertex {ids[row]}")
@@ -63,14 +64,14 @@ def check_motions(motions: Floats, kind: str, name: Callable[[int], str]) -> Non
         raise GraphError(f"{name(row)} {_fault(motions[row])} ({int(wrong.sum())} such {kind})")
 
 
-def check_rows(rows: Ints, vertex_count: int, name: str) -> None:
-    """Raises `GraphError` where one of the rows is outside 0 … V − 1, or they are a mask."""
+def check_fixed(rows: Ints, vertex_count: int) -> None:
+    """Raises `GraphError` where one of the rows of fixed vertices is outside 0 … V − 1, or they are a mask."""
     if rows.dtype == bool:
-        raise GraphError(f"{name} is a mask: give the rows, as np.flatnonzero makes them")
+        raise GraphError("fixed is a mask: give the rows, as np.flatnonzero makes them")
     outside = (rows < 0) | (rows >= vertex_count)
     if outside.any():
         raise GraphError(
-            f"{name} names vertex row {rows[np.argmax(outside)]}, but the graph has {vertex_count} vertices: "
+            f"fixed names vertex row {rows[np.argmax(outside)]}, but the graph has {vertex_count} vertices: "
             f"give rows from 0 to {vertex_count - 1}, not the vertices' ids"
         )
 

@@ -33,11 +33,8 @@ class HodgeDecomposition:
         Columns 0-2 are the rotation, the rest the translation. Depends on the world's origin: form ω around the
         centroid (see `centroids`).
         """
-        return Energies(simplices, *(self._energy(part) for part in (self.exact, self.coexact, self.harmonic)))
-
-    def _energy(self, form: Floats) -> tuple[float, float]:
-        columns = self.weights @ form**2
-        return float(columns[:3].sum()), float(columns[3:].sum())
+        columns = [self.weights @ part**2 for part in (self.exact, self.coexact, self.harmonic)]
+        return Energies(simplices, *((float(part[:3].sum()), float(part[3:].sum())) for part in columns))
 
 
 def hodge_decomposition(d0: csr_matrix, d1: csr_matrix, omega: Floats, weights: Floats) -> HodgeDecomposition:

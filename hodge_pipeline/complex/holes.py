@@ -12,6 +12,7 @@ from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Ints
 
 MOST_TRIANGLES = 100_000
+"""A limit on time: a ring of 9000 vertices with 54,000 triangles takes 31 s."""
 CHORDS_AT_A_TIME = 4096
 """Whose loops are held in memory: those of a large graph are long."""
 

@@ -10,7 +10,7 @@ from scipy.sparse import csr_matrix
 from hodge_pipeline import se3
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, Ints, PointCloud
-from hodge_pipeline.types.cell_keys import REACH, keys_of_cells
+from hodge_pipeline.types.arrays import REACH, keys_of_cells
 
 
 def voxels(points_in_world: Floats, voxel_m: float, origin: Ints) -> Ints:

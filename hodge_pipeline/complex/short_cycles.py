@@ -13,6 +13,7 @@ from hodge_pipeline.types import Bools, Ints
 NEIGHBOURS = 8
 """Neighbours of each end of an edge that are tried for a square: a limit on cost."""
 EDGES_AT_ONCE = 20_000
+"""With 64 pairs of neighbours each, whose columns take 10 MB apiece."""
 LONGEST_ENTRIES = 5_000_000
 """Edges of all loops of chords together: a limit on memory."""
 

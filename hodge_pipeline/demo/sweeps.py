@@ -88,22 +88,16 @@ class SpinningScanner:
             x, y, heading = map(float, self.road.place(np.array(way)))
             lane = se3.from_parts(se3.so3_exp(np.array([0, 0, heading])), np.array([x, y, 0.2]))
             car_from_world = se3.inverse(lane @ se3.from_parts(np.eye(3), np.array([0.0, LANE_M, 0.0])))
-            nearest = np.minimum(nearest, _to_box(_in_frame(car_from_world, rays), np.array(CAR)))
+            origins, turned = se3.transform(car_from_world, rays[..., :3]), rays[..., 3:] @ car_from_world[:3, :3].T
+            nearest = np.minimum(nearest, _to_box(origins, turned, np.array(CAR)))
         return nearest
 
 
-def _in_frame(b_from_a: Floats, rays: Floats) -> Floats:
-    """Rays (…, 6) in frame b."""
-    return np.concatenate(
-        [rays[..., :3] @ b_from_a[:3, :3].T + b_from_a[:3, 3], rays[..., 3:] @ b_from_a[:3, :3].T], axis=-1
-    )
-
-
-def _to_box(rays: Floats, size: Floats) -> Floats:
-    """The range (…) at which rays (…, 6) hit a box of this size that stands on the origin, by the slab test."""
+def _to_box(origins: Floats, directions: Floats, size: Floats) -> Floats:
+    """The range (…) at which rays (…, 3) hit a box of this size that stands on the origin, by the slab test."""
     low, high = np.array([-size[0] / 2, -size[1] / 2, 0.0]), np.array([size[0] / 2, size[1] / 2, size[2]])
     with np.errstate(divide="ignore", invalid="ignore"):
-        a, b = (low - rays[..., :3]) / rays[..., 3:], (high - rays[..., :3]) / rays[..., 3:]
+        a, b = (low - origins) / directions, (high - origins) / directions
     enter, leave = np.fmin(a, b).max(axis=-1), np.fmax(a, b).min(axis=-1)
     return np.where((enter <= leave) & (enter > 0), enter, np.inf)
 

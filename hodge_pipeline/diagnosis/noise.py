@@ -82,12 +82,16 @@ def edge_noise(
     with errors as large as motions any loop would close, with errors as small as rounding none.
     """
     informed, ones = not has_unit_information(graph), np.ones(graph.edge_count)
-    own = [_deviation(each) for each in mean_variances(there, graph.dimension == 2)] if informed else [ones, ones]
+    own = [ones, ones]
+    if informed:
+        variances = mean_variances(there, graph.dimension == 2)
+        own = [np.asarray(np.sqrt(np.where(each > 0, each, np.inf))) for each in variances]
     rotation, translation = map(_proportions, own)
     short = np.flatnonzero(loops.lengths <= LONGEST_CYCLE)
     any_cycle, loops = len(loops) > 0, loops.select(short)
     turned, shifted = _Errors(loops, rotation, angle[short]), _Errors(loops, translation, displacement_m[short])
-    usual = DEFAULT_ANGLE_RAD, DEFAULT_SHARE * max(reach_m, ABOUT_A_POINT * _usual_step(graph))
+    step_m = float(np.median(np.linalg.norm(graph.i_from_j[:, :3, 3], axis=1))) if graph.edge_count else 0.0
+    usual = DEFAULT_ANGLE_RAD, DEFAULT_SHARE * max(reach_m, ABOUT_A_POINT * step_m)
     stated = usual if not informed else (_median(rotation), _median(translation))
     credible = tuple(map(_credible, stated, usual, (turned.median_scale(), shifted.median_scale())))
     turn = turned.scale(FIRST_GATE_RAD, prior, credible[0] if informed else usual[0])
@@ -114,10 +118,6 @@ def recentred(graph: ViewGraph, point: Floats) -> ViewGraph:
     return replace(graph, i_from_j=motions, information=there.T @ graph.information @ there)
 
 
-def _usual_step(graph: ViewGraph) -> float:
-    return float(np.median(np.linalg.norm(graph.i_from_j[:, :3, 3], axis=1))) if graph.edge_count else 0.0
-
-
 def _median(deviation: Floats) -> float:
     return float(np.median(deviation)) if len(deviation) else 1.0
 
@@ -135,10 +135,6 @@ def _doubt(stated: tuple[float, float], taken: tuple[float, float]) -> str:
         "the information states errors that the graph does not show, and too few short cycles close to tell: judged "
         f"with {turn:.2g} times these in rotation, {shift:.2g} times in translation"
     )
-
-
-def _deviation(variance: Floats) -> Floats:
-    return np.asarray(np.sqrt(np.where(variance > 0, variance, np.inf)))
 
 
 def _proportions(stated: Floats) -> Floats:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -40,19 +39,13 @@ def block_distances(block: DistanceBlock) -> Floats:
     """
     clouds = CloudSet.open(block.clouds_folder)
     out = np.full(block.i_from_j.shape[:2], np.nan)
-    for i, columns in _columns_by_target(block.pairs):
+    for i, columns in groupby(range(len(block.pairs)), key=lambda column: int(block.pairs[column, 0])):
         plane = TargetPlanes(clouds[i], block.scale)
         for column in columns:
             points = clouds[int(block.pairs[column, 1])].points_in_cam
             points_in_j = points[:: max(1, -(-len(points) // block.points))].astype(np.float64)
             out[:, column] = [plane.distance(points_in_j, motion) for motion in block.i_from_j[:, column]]
     return out
-
-
-def _columns_by_target(pairs: Ints) -> Iterator[tuple[int, list[int]]]:
-    """(i, columns) of the pairs of each first cloud i."""
-    for i, columns in groupby(range(len(pairs)), key=lambda column: int(pairs[column, 0])):
-        yield i, list(columns)
 
 
 class TargetPlanes:

@@ -20,6 +20,7 @@ BYTES_A_VOXEL = 4 + 4 + 12 + 16
 GROWTH_COPIES = 3
 """Memory while the grid doubles, in sizes of the old one: the old blocks and twice as many new ones."""
 FIRST_BLOCKS = 8000
+"""147 MB, from which the grid doubles as it fills."""
 GREY = 128
 """Grey level of voxels in a block that no image has coloured."""
 COLOUR_OFFSET = 1
@@ -27,6 +28,7 @@ COLOUR_OFFSET = 1
 COLOUR_SCALE = 255.0
 """By which open3d multiplies the colours of a float image in a grid, and divides those of a mesh."""
 BLOCKS_AT_ONCE = 1000
+"""18 MB of voxels, which are copied to be looked at."""
 TOUCH_STRIDE = 4
 """open3d samples every fourth row and column of a depth image to find the blocks that it touches."""
 

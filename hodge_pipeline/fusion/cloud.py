@@ -14,8 +14,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.fusion.views import Skipped, posed
 from hodge_pipeline.stages import Advance, no_progress
 from hodge_pipeline.types import Bools, Bytes, Camera, Floats, Floats32, Frame, Ints, Model, PointCloud
-from hodge_pipeline.types.arrays import middles_in
-from hodge_pipeline.types.cell_keys import REACH, cells_of_keys, keys_of_cells
+from hodge_pipeline.types.arrays import REACH, cells_of_keys, keys_of_cells, middles_in
 from hodge_pipeline.types.text import counted
 
 POINTS_AT_ONCE = 1 << 20

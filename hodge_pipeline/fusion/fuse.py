@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_pipeline.scene import KeyFrames, Scene
+from hodge_pipeline.scene import Scene
 from hodge_pipeline.stages import Fuser, Step, Steps
-from hodge_pipeline.types import Bools, Floats, Source
+from hodge_pipeline.types import Floats, Source
 from hodge_pipeline.types.notes import Note, notes_of
 from hodge_pipeline.types.output_files import replacing
 from hodge_pipeline.types.ply import model_parts
@@ -22,13 +22,13 @@ def fuse_all(
 
     Every frame with a pose of its own is fused, key frame or not; of `keys_only` the key frames alone, which is faster.
     """
-    if keys_only and not scene.key_frames.are_all:
-        rows = scene.key_frames.rows
-        source, poses, placed = scene.source, world_from_cam[rows], scene.clouds.sizes > 0
+    keys, has_cloud = scene.key_frames, scene.clouds.sizes > 0
+    if keys_only and not keys.are_all:
+        source, poses, placed = scene.source, world_from_cam[keys.rows], has_cloud
         steps.note(Note("fused key frames", len(source.frames)))
     else:
         source, poses = scene.whole, world_from_cam
-        placed = _placed(scene.key_frames, scene.clouds.sizes > 0)
+        placed = has_cloud if keys.are_all else keys.found
     poses = np.asarray(np.where(placed[:, None, None], poses, np.nan))
     files = [
         steps.step(fuse, fuser, source, poses, title=f"fusion {row}", total=len(source.frames))
@@ -45,8 +45,3 @@ def fuse(fuser: Fuser, source: Source, world_from_cam: Floats, *, step: Step) ->
         file.writelines(model_parts(model))
     step.note(*notes_of("fuser", model.notes))
     return path
-
-
-def _placed(key_frames: KeyFrames, has_cloud: Bools) -> Bools:
-    """Where (N,) a frame was placed: a key frame by its cloud, where every frame is one; else as the start found it."""
-    return has_cloud if key_frames.are_all else key_frames.found

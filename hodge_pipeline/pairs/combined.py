@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.pairs.candidates import has_reason, merge
 from hodge_pipeline.pairs.sequential import SequentialEdges
-from hodge_pipeline.stages import EdgeBuilder
+from hodge_pipeline.stages import OPTIONS, EdgeBuilder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Ints
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
+@dataclass(frozen=True, config=OPTIONS)
 class CombinedEdges:
     """Unites or intersects the pairs of several builders; sequential pairs always stay."""
 

@@ -56,8 +56,9 @@ class PlaceEdges:
         rows = usable_rows(clouds)
         if len(rows) < 2:
             return Edges.proposed(NO_PAIRS, "place")
-        some = rows[:: max(1, len(rows) // SAMPLED_CLOUDS)]
-        reach_m = float(np.median([_range_m(clouds[row]) for row in some.tolist()]))
+        some = clouds.read(rows[:: max(1, len(rows) // SAMPLED_CLOUDS)])
+        ranges_m = [np.quantile(np.hypot(*cloud.points_in_cam[:, :2].T), RANGE_QUANTILE) for cloud in some]
+        reach_m = float(np.median(ranges_m))
         contexts = np.array([context(cloud, reach_m) for cloud in clouds.read(rows)])
         names = np.array([frames[row].sequence for row in rows], dtype=np.str_)
         near = _nearest_rings(contexts, min(self.compared, len(rows)))
@@ -83,10 +84,6 @@ def context(cloud: PointCloud, reach_m: float) -> Floats32:
     cells = np.zeros((RINGS, SECTORS), np.float32)
     np.maximum.at(cells, (ring, (turn * SECTORS).astype(np.int64) % SECTORS), heights.astype(np.float32))
     return np.asarray(gaussian_filter(cells, BLUR_CELLS, mode=("constant", "wrap")))
-
-
-def _range_m(cloud: PointCloud) -> float:
-    return float(np.quantile(np.hypot(*cloud.points_in_cam[:, :2].T), RANGE_QUANTILE))
 
 
 def _nearest_rings(contexts: Floats32, count: int) -> Ints:

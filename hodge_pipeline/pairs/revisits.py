@@ -7,7 +7,7 @@ each loop closure corrects the poses after it.
 from __future__ import annotations
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
@@ -18,7 +18,7 @@ from hodge_pipeline.pairs.candidates import NO_PAIRS
 from hodge_pipeline.pairs.drift import median_range_m, path_length_m
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.pairs import PreparedClouds
-from hodge_pipeline.stages import Advance, Registrar, no_progress
+from hodge_pipeline.stages import OPTIONS, Advance, Registrar, no_progress
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Registration
 
 REVISIT = "revisit"
@@ -37,7 +37,7 @@ VOXEL_RANGES = 0.1
 """Least side, in median ranges, of the voxels in which overlap is measured: .2 m in a room."""
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
+@dataclass(frozen=True, config=OPTIONS)
 class Revisits:
     """How loops are closed along the path, before any pair is proposed."""
 

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from hodge_pipeline.pairs.candidates import NO_PAIRS, row_blocks
-from hodge_pipeline.types import Bools, Floats32, Ints
+from hodge_pipeline.types import Floats32, Ints
 
 SAMPLED_DESCRIPTORS, LLOYD_STEPS = 20_000, 12
 """Local descriptors of all frames, and steps of k-means, that a vocabulary is learnt by: limits on cost."""
@@ -27,7 +27,8 @@ def vocabulary(features: LocalFeatures, rows: Ints, words: int, seed: int) -> Fl
     """Centres (at most `words`, D) of the frames' own descriptors, by k-means from a seeded sample."""
     rng = np.random.default_rng(seed)
     share = max(1, SAMPLED_DESCRIPTORS // max(1, len(rows)))
-    sample = [_sampled(features.descriptors(int(row)), share, rng) for row in rows]
+    every = (features.descriptors(int(row)) for row in rows)
+    sample = [found[rng.permutation(len(found))[:share]] for found in every]
     points = np.concatenate(sample) if sample else np.zeros((0, 128), np.float32)
     centres = points[rng.permutation(len(points))[:words]]
     for _ in range(LLOYD_STEPS if len(points) else 0):
@@ -35,10 +36,6 @@ def vocabulary(features: LocalFeatures, rows: Ints, words: int, seed: int) -> Fl
         sums, counts = _sums(points, chosen, len(centres))
         centres = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1.0)[:, None], centres)
     return centres
-
-
-def _sampled(descriptors: Floats32, count: int, rng: np.random.Generator) -> Floats32:
-    return descriptors[rng.permutation(len(descriptors))[:count]]
 
 
 def _nearest(points: Floats32, centres: Floats32) -> Ints:
@@ -78,7 +75,7 @@ def most_similar(vectors: Floats32, per_row: int, excluded_reach: int) -> Ints:
     for rows in row_blocks(count):
         block = np.arange(rows.start, rows.stop)
         scores = vectors[block] @ vectors.T
-        scores[_near(block, count, excluded_reach)] = -np.inf
+        scores[np.abs(np.arange(count) - block[:, None]) <= excluded_reach] = -np.inf
         padded = np.full((len(block), len(starts) * window), -np.inf, np.float32)
         padded[:, :count] = scores
         in_windows = padded.reshape(len(block), len(starts), window)
@@ -88,7 +85,3 @@ def most_similar(vectors: Floats32, per_row: int, excluded_reach: int) -> Ints:
         usable = np.isfinite(np.take_along_axis(best, chosen, axis=1))
         found.append(np.stack([np.broadcast_to(block[:, None], partner.shape)[usable], partner[usable]], axis=1))
     return np.unique(np.sort(np.concatenate(found), axis=1), axis=0)
-
-
-def _near(block: Ints, count: int, reach: int) -> Bools:
-    return np.asarray(np.abs(np.arange(count)[None, :] - block[:, None]) <= reach)

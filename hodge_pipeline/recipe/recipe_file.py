@@ -121,15 +121,12 @@ def _overridden(document: Document, override: str) -> Document:
         raise RecipeError(f"{name}: expected a.b=value")
     given = yaml_file.parse_value(text, name)
     value = given.data["value"]
-    typed, change = _typed(keys), _nested(document.data, keys, value, name)
+    typed = tuple(int(key) if key.isdigit() else key for key in keys)
+    change = _nested(document.data, keys, value, name)
     merges = isinstance(value, dict)
     kept = {key: line for key, line in document.origins.items() if merges or key[: len(typed)] != typed}
     new = {(*typed, *inside[1:]): name for inside in given.origins if inside}
     return Document(change, {**{typed[:end]: name for end in range(1, len(typed))}, **kept, **new})
-
-
-def _typed(keys: list[str]) -> Keys:
-    return tuple(int(key) if key.isdigit() else key for key in keys)
 
 
 def _nested(data: Any, keys: list[str], value: Any, name: str) -> Any:
@@ -142,7 +139,7 @@ def _nested(data: Any, keys: list[str], value: Any, name: str) -> Any:
             raise RecipeError(f"{name}: '{head}' is not a row of a list of {len(data)}")
         row = int(head)
         return [*data[:row], _nested(data[row], rest, value, name), *data[row + 1 :]]
-    if isinstance(data, str) and data in _stage_names():
+    if isinstance(data, str) and any(data in registry.names(kind) for kind in registry.KINDS):
         data = {"stage": data}
     if data is not None and not isinstance(data, dict):
         raise RecipeError(f"{name}: '{head}' lies in a value that has no options: {data!r}")
@@ -150,7 +147,3 @@ def _nested(data: Any, keys: list[str], value: Any, name: str) -> Any:
     if head == "stage" and not rest and old.get("stage") != value:
         return {"stage": value}
     return {**old, head: _nested(old.get(head), rest, value, name)}
-
-
-def _stage_names() -> set[str]:
-    return {name for kind in registry.KINDS for name in registry.names(kind)}

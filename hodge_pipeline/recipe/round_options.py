@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import Literal, TypeAlias
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.pairs.overlap import OverlapEdges
-from hodge_pipeline.stages import EdgeBuilder
+from hodge_pipeline.stages import OPTIONS, EdgeBuilder
 
 SolveWith: TypeAlias = Literal["all", "kept"]
 """The edges that a round is solved with: all that were accepted, or of these what the diagnosis keeps."""
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
+@dataclass(frozen=True, config=OPTIONS)
 class SuggestionOptions:
     """Pairs that the diagnosis suggests, registered as well: what tests an edge, joins pieces, holds what is loose."""
 

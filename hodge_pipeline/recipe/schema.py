@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import registry
@@ -22,12 +22,19 @@ from hodge_pipeline.registration.acceptance import Acceptance
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.sources.inspect import guess_reader
 from hodge_pipeline.sources.measured_edges import MeasuredOptions
-from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Executor, FrameReader, Fuser, Registrar, Start
+from hodge_pipeline.stages import (
+    OPTIONS,
+    ConsistencySolver,
+    EdgeBuilder,
+    Executor,
+    FrameReader,
+    Fuser,
+    Registrar,
+    Start,
+)
 from hodge_pipeline.start.key_frames import KeyFrameStart
 from hodge_pipeline.start.known_positions import PositionOptions
 from hodge_pipeline.store import yaml_file
-
-OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 
 
 @dataclass(frozen=True, config=OPTIONS)

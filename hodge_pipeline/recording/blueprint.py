@@ -11,6 +11,7 @@ from hodge_pipeline.recording.eye import Eye, Eyes
 from hodge_pipeline.types.text import markdown_table
 
 BACKGROUND = (24, 26, 32)
+STORY_TAB = "Story"
 COLOUR_NAMES = {"truth": "green", "odometry": "orange", "start": "violet"}
 
 
@@ -38,9 +39,11 @@ class Contents:
         return any(path == parent or path.startswith(f"{parent}/") for path in self.entities)
 
 
-def make_blueprint(contents: Contents, eyes: Eyes) -> rrb.Blueprint:
-    """The default blueprint: a tab for each part of the run that is there, the story first."""
-    return without_panels(rrb.Tabs(*make_tabs(contents, eyes), active_tab=0), layout.STORY)
+def make_blueprint(contents: Contents, eyes: Eyes, opened: str = STORY_TAB) -> rrb.Blueprint:
+    """The default blueprint: a tab for each part of the run that is there; it opens on the one of this name."""
+    tabs = make_tabs(contents, eyes)
+    at = [tab.name for tab in tabs].index(opened)
+    return without_panels(rrb.Tabs(*tabs, active_tab=at), layout.STORY)
 
 
 def without_panels(root: rrb.Container, timeline: str) -> rrb.Blueprint:
@@ -110,7 +113,7 @@ def _story_tab(contents: Contents, eye: Eye | None) -> rrb.Horizontal:
             rrb.TextDocumentView(origin=layout.graph_text(max(contents.last_graph, 1)), name="Viewing graph"),
         ),
     )
-    return rrb.Horizontal(scene, side, column_shares=[3, 1], name="Story")
+    return rrb.Horizontal(scene, side, column_shares=[3, 1], name=STORY_TAB)
 
 
 def _images(contents: Contents, *paths: str) -> list[rrb.Spatial2DView]:

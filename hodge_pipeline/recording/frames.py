@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
+from typing import TypeAlias
 
 import numpy as np
 import rerun as rr
@@ -27,6 +28,8 @@ MOST_POINTS = 300_000
 SIZED_FRAMES, MARGIN = 16, 1.1
 """Frames whose images are read to estimate the size of all, and the safety factor on their mean: of red kitchen's
 frames the largest is 1.2 times the mean, and the mean of 16 is known to 3 %."""
+Reader: TypeAlias = Callable[[], EncodedImage] | None
+"""Reads an encoded image, where a frame has one."""
 
 
 def log_frames(part: Part, name: str, frames: Sequence[Frame], notes: Sequence[str]) -> None:
@@ -41,11 +44,12 @@ def log_frames(part: Part, name: str, frames: Sequence[Frame], notes: Sequence[s
     _log_names(stream, frames)
     _log_cameras(stream, frames)
     kept = 0
-    for path, reader in ((layout.COLOUR, _colour), (layout.DEPTH, _depth)):
-        for chunk_rows, images in _chunks(frames, rows, reader):
+    colours, depths = ([getattr(frames[row], name) for row in rows] for name in ("encoded_colour", "encoded_depth"))
+    for path, readers in ((layout.COLOUR, colours), (layout.DEPTH, depths)):
+        for chunk_rows, images in _chunks(rows, readers):
             _log_images(stream, path, frame_columns(frames, len(frames), chunk_rows), images)
             kept += len(images)
-    wished = sum((frames[row].encoded_colour is not None) + (frames[row].encoded_depth is not None) for row in rows)
+    wished = sum(read is not None for read in (*colours, *depths))
     if kept < wished:
         part.note(f"{counted(wished - kept, 'image')} cannot be read and are not shown", level="WARN")
 
@@ -77,7 +81,10 @@ def _sizes(frames: Sequence[Frame]) -> Floats:
     """Bytes (N,) of the frames' images; of many frames the mean of a few, with a margin, since an undistorted image is
     encoded again each time.
     """
-    some = [sum(len(image.contents) for image in _images(frames[row])) for row in evenly(len(frames), SIZED_FRAMES)]
+    some = []
+    for row in evenly(len(frames), SIZED_FRAMES):
+        images = map(_encoded, (frames[row].encoded_colour, frames[row].encoded_depth))
+        some.append(sum(len(image.contents) for image in images if image is not None))
     if len(some) == len(frames):
         return np.array(some, float)
     return np.full(len(frames), MARGIN * np.mean(some))
@@ -115,15 +122,7 @@ def _log_counts(stream: rr.RecordingStream, frames: Sequence[Frame], sizes: Ints
     stream.send_columns(layout.under(layout.FRAME_PLOTS, "points"), frame_columns(frames, len(sizes), rows), scalars)
 
 
-def _colour(frame: Frame) -> EncodedImage | None:
-    return _encoded(frame.encoded_colour)
-
-
-def _depth(frame: Frame) -> EncodedImage | None:
-    return _encoded(frame.encoded_depth)
-
-
-def _encoded(read: Callable[[], EncodedImage] | None) -> EncodedImage | None:
+def _encoded(read: Reader) -> EncodedImage | None:
     """The image, None where there is none or it cannot be read: that is counted, and no reason to end a run."""
     try:
         return read() if read else None
@@ -131,18 +130,12 @@ def _encoded(read: Callable[[], EncodedImage] | None) -> EncodedImage | None:
         return None
 
 
-def _images(frame: Frame) -> list[EncodedImage]:
-    return [image for image in (_colour(frame), _depth(frame)) if image is not None]
-
-
-def _chunks(
-    frames: Sequence[Frame], rows: Ints, reader: Callable[[Frame], EncodedImage | None]
-) -> Iterator[tuple[Ints, list[EncodedImage]]]:
+def _chunks(rows: Ints, readers: Sequence[Reader]) -> Iterator[tuple[Ints, list[EncodedImage]]]:
     """Rows and images, in lots of about `CHUNK_BYTES`."""
     lot: list[tuple[int, EncodedImage]] = []
     lot_bytes = 0
-    for row in rows:
-        image = reader(frames[row])
+    for row, read in zip(rows, readers, strict=True):
+        image = _encoded(read)
         if image is None:
             continue
         if lot and lot_bytes + len(image.contents) > CHUNK_BYTES:

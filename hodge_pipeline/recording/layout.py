@@ -142,8 +142,3 @@ def parse_part(file_name: str) -> tuple[str, str]:
     """Stage and detail of a part's file name; empty where it is none."""
     match = _PART.match(file_name.removesuffix(PART_SUFFIX))
     return (match["stage"], match["detail"] or "") if match else ("", "")
-
-
-def outer_number(outer: int, offset: int) -> int:
-    """The part number of stage `offset` in outer round 1, 2, …: below 890, the diagnosis' in `Recorder`."""
-    return min(10 * outer, 880) + offset

@@ -1,4 +1,4 @@
-"""Stream a running run to a viewer on this machine, part by part."""
+"""Stream a running run to a viewer on this machine, part by part; run its program with telemetry off."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ import time
 import webbrowser
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from importlib.resources import files
 from pathlib import Path
 from urllib.parse import quote
 
 from hodge_pipeline.errors import WorkspaceError
-from hodge_pipeline.recording import binary, layout
+from hodge_pipeline.recording import layout
 from hodge_pipeline.recording.blueprint import legend, make_blueprint
 from hodge_pipeline.recording.merge import contents_of, eyes, readers_of, send, with_entities
 from hodge_pipeline.recording.stream import log_markdown, open_stream
@@ -25,6 +26,7 @@ PORT, WEB_PORT = 9876, 9090
 """Those of Rerun, for data and for the page."""
 START_S = 60.0
 """That a viewer may take until it listens."""
+TIMEOUT_S = 120.0
 
 
 class Live:
@@ -82,7 +84,7 @@ def served(recordings: Sequence[Path], *, opens_browser: bool = False) -> Iterat
     flags = ["--serve-web", "--bind", HOST, "--port", str(port), "--web-viewer-port", str(web_port)]
     with (
         tempfile.TemporaryDirectory(prefix="hodge-viewer-") as scratch,
-        _running(flags, recordings, binary.quiet_environment(Path(scratch))) as process,
+        _running(flags, recordings, quiet_environment(Path(scratch))) as process,
     ):
         wait_for(port, process)
         wait_for(web_port, process)
@@ -112,7 +114,7 @@ def start(flags: Sequence[str], environment: dict[str, str] | None = None) -> su
     """The viewer's program with these flags, out of reach of this terminal's Ctrl-C."""
     try:
         return subprocess.Popen(
-            [str(binary.program()), *flags],
+            [str(program()), *flags],
             env=environment,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -148,3 +150,30 @@ def wait_for(port: int, process: subprocess.Popen[bytes]) -> None:
                 "the Rerun viewer does not start: is there a screen? `hodge view RUN --web` needs none"
             )
         time.sleep(0.1)
+
+
+def program() -> Path:
+    """Path of the `rerun` binary; the `rerun` on PATH is a wrapper that leaves it running when killed."""
+    name = "rerun.exe" if os.name == "nt" else "rerun"
+    return Path(os.environ.get("RERUN_CLI_PATH") or str(files("rerun_cli") / name))
+
+
+def quiet_environment(scratch: Path) -> dict[str, str]:
+    """An environment in which the program keeps its settings in `scratch`, telemetry disabled there."""
+    environment = os.environ | {
+        "HOME": str(scratch),
+        "XDG_CONFIG_HOME": str(scratch / "config"),
+        "XDG_DATA_HOME": str(scratch / "data"),
+        "XDG_CACHE_HOME": str(scratch / "cache"),
+        "APPDATA": str(scratch / "appdata"),
+        "LOCALAPPDATA": str(scratch / "localappdata"),
+    }
+    run_program(["analytics", "disable"], environment)
+    return environment
+
+
+def run_program(arguments: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    """The finished process; raises `subprocess.CalledProcessError` where it failed, `OSError` where it is missing."""
+    return subprocess.run(
+        [str(program()), *arguments], env=environment, capture_output=True, text=True, timeout=TIMEOUT_S, check=True
+    )

@@ -11,17 +11,17 @@ import rerun as rr
 from rerun.chunk import Chunk, RrdReader
 
 from hodge_pipeline.recording import layout
-from hodge_pipeline.recording.blueprint import Contents, legend, make_blueprint
+from hodge_pipeline.recording.blueprint import STORY_TAB, Contents, legend, make_blueprint
 from hodge_pipeline.recording.eye import Eyes, look_at, look_from, points_of
 from hodge_pipeline.recording.stream import log_markdown, writing
 
 
-def merge(parts: Iterable[Path], out: Path, recording_id: str) -> None:
-    """One file of these parts, in the order of the run that their names say; it opens on the story."""
+def merge(parts: Iterable[Path], out: Path, recording_id: str, opened: str = STORY_TAB) -> None:
+    """One file of these parts, in the order of the run that their names say; it opens on the tab of this name."""
     parts = sorted(parts, key=lambda part: part.name)
     readers = readers_of(parts)
     contents = with_entities(contents_of(parts), readers.values())
-    blueprint = make_blueprint(contents, eyes(contents, readers.values()))
+    blueprint = make_blueprint(contents, eyes(contents, readers.values()), opened)
     with writing(out, recording_id, blueprint) as stream:
         for reader in readers.values():
             send(stream, reader, layout.poses(contents.trajectory))

@@ -117,7 +117,8 @@ class Recorder:
         merge(find_parts(self.folder), out, self.recording_id)
 
     def _round(self, offset: int, stage: str, outer: int, log: Callable[[Part], None]) -> Notes:
-        return self._part(layout.outer_number(outer, offset), stage, str(outer), log, slot=outer)
+        number = min(10 * outer, 880) + offset  # below that of the diagnosis
+        return self._part(number, stage, str(outer), log, slot=outer)
 
     def _part(self, number: int, stage: str, detail: str, log: Callable[[Part], None], *, slot: int = 0) -> Notes:
         self.folder.mkdir(parents=True, exist_ok=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from hodge_pipeline import se3
@@ -84,8 +86,7 @@ def thin_model(model: Model, kept: int) -> Model:
     if len(model.points_in_world) <= kept:
         return model
     if model.triangles is None:
-        rows = evenly(len(model.points_in_world), kept)
-        return _replace(model, rows, None)
+        return _kept(model, evenly(len(model.points_in_world), kept), None)
     return _clustered(model, kept)
 
 
@@ -94,18 +95,15 @@ def _clustered(model: Model, kept: int) -> Model:
     low = points.min(axis=0)
     voxel_m = max(float(np.ptp(points, axis=0).max()) / 2000, 1e-9)
     while True:
-        _, first, cluster = np.unique(_voxels(points - low, voxel_m), return_index=True, return_inverse=True)
+        cells = np.floor((points - low) / voxel_m).astype(np.int64)
+        voxels = numbered(cells, cells.max(axis=0) + 1)
+        _, first, cluster = np.unique(voxels, return_index=True, return_inverse=True)
         if len(first) <= kept:
             break
         voxel_m *= max(1.05, float(np.sqrt(len(first) / kept)))
     triangles = cluster.reshape(-1)[np.asarray(model.triangles)]
     a, b, c = triangles.T
-    return _replace(model, first, triangles[(a != b) & (b != c) & (a != c)].astype(np.int32))
-
-
-def _voxels(offsets: Floats, voxel_m: float) -> Ints:
-    cells = np.floor(offsets / voxel_m).astype(np.int64)
-    return numbered(cells, cells.max(axis=0) + 1)
+    return _kept(model, first, triangles[(a != b) & (b != c) & (a != c)].astype(np.int32))
 
 
 def numbered(cells: Ints, size: Ints) -> Ints:
@@ -113,12 +111,9 @@ def numbered(cells: Ints, size: Ints) -> Ints:
     return np.asarray((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2])
 
 
-def _replace(model: Model, rows: Ints, triangles: np.ndarray[tuple[int, ...], np.dtype[np.int32]] | None) -> Model:
-    return Model(
-        name=model.name,
-        points_in_world=model.points_in_world[rows],
-        normals_in_world=None if model.normals_in_world is None else model.normals_in_world[rows],
-        colours=None if model.colours is None else model.colours[rows],
-        triangles=triangles,
-        notes=model.notes,
-    )
+def _kept(model: Model, rows: Ints, triangles: np.ndarray[tuple[int, ...], np.dtype[np.int32]] | None) -> Model:
+    """The model of these of its points alone."""
+    normals = None if model.normals_in_world is None else model.normals_in_world[rows]
+    colours = None if model.colours is None else model.colours[rows]
+    points = model.points_in_world[rows]
+    return replace(model, points_in_world=points, normals_in_world=normals, colours=colours, triangles=triangles)

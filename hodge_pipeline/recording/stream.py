@@ -113,7 +113,7 @@ def _finish(stream: rr.RecordingStream, partial: Path) -> None:
             if "timed out" in str(error) and stalled_s < STALLED_S and not is_full:
                 continue
             rr.unregister_shutdown()
-            Thread(target=_hold, args=(stream,), daemon=True).start()
+            Thread(target=lambda _: Event().wait(), args=(stream,), daemon=True).start()
             raise _unwritable(partial) from error
         stream.disconnect()
         return
@@ -124,10 +124,6 @@ def _unwritable(partial: Path) -> WorkspaceError:
         f"{partial.parent}: the recording cannot be written (is the disk full?): what was finished stays; "
         "make room and run the same command again"
     )
-
-
-def _hold(_: rr.RecordingStream) -> None:
-    Event().wait()
 
 
 def story_columns(slot: int, share: Floats) -> list[rr.TimeColumn]:

@@ -1,14 +1,21 @@
-"""Given and refined poses beside the motions that images show: a guard apart from the clouds."""
+"""Given and refined poses beside the motions that optical flow of corners shows: a guard apart from the clouds.
+
+A sensor may warp all clouds alike: they then fit each other best at wrong poses. Depth enters by the parallax alone, so
+depth that is 5 % off makes a step 5 % longer or shorter.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
+from hodge_pipeline import se3
+from hodge_pipeline.errors import SourceError
 from hodge_pipeline.refine.guard import NOISE_SIGMAS, Measure
-from hodge_pipeline.refine.image_steps import MOST_STEPS, step_errors_m
+from hodge_pipeline.registration.tracking.flow import FlowImage, find_corners, flow_image, follow
 from hodge_pipeline.rounds.one_round import Work
 from hodge_pipeline.scene import KeyFrames
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.stages import Step
+from hodge_pipeline.types import Floats, Frame, Ints, Source
 from hodge_pipeline.types.arrays import evenly
 from hodge_pipeline.types.notes import Note
 
@@ -19,6 +26,10 @@ ROUGHER = 0.1
 """Share from which on rougher steps are reported."""
 FEWEST_STEPS = 6
 """Steps that images measure: fewer are not judged."""
+MOST_STEPS = 100
+"""Steps that are tested, evenly over the sequence: 30 ms each at 640x480."""
+RANGE_M = (0.1, 100.0)
+"""Depth that counts, in units of the recipe's scale."""
 
 
 def first_of_steps(key_frames: KeyFrames) -> Ints:
@@ -52,3 +63,29 @@ def against_images(work: Work, key_frames: KeyFrames, after: Floats) -> list[Mea
         work.steps.note(Note("rougher", detail=f"{mean[1]:.3g} mm off, before {mean[0]:.3g} mm"))
     tolerance_mm = max(NOISE_SIGMAS * error_mm, STEP_TOLERANCE * mean[0], STEP_TOLERANCE_MM * scale)
     return [Measure("steps off those of images", *mean, tolerance=tolerance_mm, unit="mm")]
+
+
+def step_errors_m(source: Source, pairs: Ints, pose_sets: Floats, unit_m: float, *, step: Step) -> Floats:
+    """Step: how far (S, P) steps between pairs (P, 2) of frames, under sets of poses (S, K, 4, 4), lie from those that
+    images show.
+
+    NaN where a pair has no readable images, or too few of its corners agree on a motion. `unit_m`: the recipe's scale.
+    """
+    off_m = np.full((len(pose_sets), len(pairs)), np.nan)
+    images: dict[int, FlowImage | None] = {}
+    for column, (i, j) in enumerate(pairs.tolist()):
+        images = {row: images[row] if row in images else _read(source.frames[row], unit_m) for row in (i, j)}
+        one, other = images[i], images[j]
+        i_from_j = se3.inverse(pose_sets[:, i]) @ pose_sets[:, j]
+        found = None if one is None or other is None else follow(find_corners(one), other, i_from_j[0])
+        if found is not None:
+            off_m[:, column] = np.linalg.norm((se3.inverse(found.key_from_view) @ i_from_j)[:, :3, 3], axis=1)
+        step.advance(1)
+    return off_m
+
+
+def _read(frame: Frame, unit_m: float) -> FlowImage | None:
+    try:
+        return flow_image(frame, (RANGE_M[0] * unit_m, RANGE_M[1] * unit_m), unit_m)
+    except (SourceError, OSError):
+        return None

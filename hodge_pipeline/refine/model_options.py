@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.recipe import binding, recipe_file
 from hodge_pipeline.registration.acceptance import Acceptance
 from hodge_pipeline.registration.clouds import CloudOptions
-from hodge_pipeline.stages import ConsistencySolver, EdgeBuilder, Executor, ModelReader, Registrar
+from hodge_pipeline.stages import OPTIONS, ConsistencySolver, EdgeBuilder, Executor, ModelReader, Registrar
 
-OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 RECIPE = "colmap_refine"
 
 

@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 from hodge_pipeline.registration.assessment import MOST_VIOLATION, SAME_FITNESS
 from hodge_pipeline.registration.odometry_path import contradicts_odometry, without_slides
 from hodge_pipeline.registration.seen_through import is_refuted
-from hodge_pipeline.registration.sliding import consecutive, weak_directions
+from hodge_pipeline.registration.sliding import are_steps, may_slide
 from hodge_pipeline.scene import Drift
 from hodge_pipeline.types import Edges, Ints
 from hodge_pipeline.types.edges import HELD_OUT, REGISTERED, REJECTED, USED
@@ -58,8 +58,8 @@ class Acceptance:
         Steps of frames that are `in_order` may slide: they stay at their guess.
         """
         out = np.full(len(registered.pairs), "", "U64")
-        weak, _ = weak_directions(registered, self.min_spread)
-        out[weak.any(axis=1) & ~(in_order & consecutive(registered))] = "what they share lets them slide"
+        slides = may_slide(registered, self.min_spread) & ~(in_order & are_steps(registered))
+        out[slides] = "what they share lets them slide"
         out[is_refuted(registered, self.max_seen_through)] = SEEN_THROUGH
         if self.max_rmse_m is not None:
             out[~(registered.rmse_m <= self.max_rmse_m)] = "points too far apart"

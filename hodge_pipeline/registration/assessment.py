@@ -89,10 +89,7 @@ def to_registration(assessment: Assessment, i_from_j: Floats, iterations: int, c
     """
     return Registration(
         i_from_j=i_from_j,
-        information=assessment.information,
-        fitness=assessment.fitness,
-        rmse_m=assessment.rmse_m,
-        correspondences=assessment.correspondences,
+        **assessment._asdict(),
         iterations=iterations,
         converged=converged and assessment.correspondences >= MIN_POINTS,
     )

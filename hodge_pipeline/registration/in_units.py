@@ -6,15 +6,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
-from hodge_pipeline.stages import Registrar
+from hodge_pipeline.stages import OPTIONS, Registrar
 from hodge_pipeline.types import Floats, PointCloud, Registration
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
+@dataclass(frozen=True, config=OPTIONS)
 class InUnits:
     """Registers clouds with `unit_m` length units per metre; results are in the clouds' unit."""
 

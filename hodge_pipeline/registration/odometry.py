@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
@@ -18,7 +18,7 @@ from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.pairs import prepared_clouds
 from hodge_pipeline.registration.seen_through import is_refuted, with_seen_through
 from hodge_pipeline.registry import plugin_errors
-from hodge_pipeline.stages import Advance, Registrar, Workers, no_progress
+from hodge_pipeline.stages import OPTIONS, Advance, Registrar, Workers, no_progress
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Registration
 
 STEPS_IN_BLOCK, WARM_UP_STEPS = 32, 2
@@ -32,7 +32,7 @@ REACHES_APART = 4.0
 """Gap between unconnected components in the layout, times the reach of a cloud, so that no two clouds meet."""
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
+@dataclass(frozen=True, config=OPTIONS)
 class OdometryOptions:
     """How the first poses are found."""
 

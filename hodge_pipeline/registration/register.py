@@ -12,10 +12,10 @@ from hodge_pipeline import se3
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.pairs import register_pairs
 from hodge_pipeline.registration.seen_through import with_seen_through
-from hodge_pipeline.registration.sliding import HELD_SPREADS, held_where_sliding, weak_directions
+from hodge_pipeline.registration.sliding import HELD_SPREADS, held_where_sliding, may_slide
 from hodge_pipeline.stages import Registrar, Step, Workers
 from hodge_pipeline.store import artifacts
-from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints
 from hodge_pipeline.types.edges import HELD_OUT, REGISTERED, USED
 
 REUSE_WITHIN_M = 0.01
@@ -91,12 +91,6 @@ def _reusable(
     registered = earlier.select(known)
     apart = (se3.inverse(registered.i_from_j) @ where[rows] for where in (guesses, before))
     moved, moved_before = (se3.displacement_m(motions, se3.ARM_M * scale) for motions in apart)
-    nearer = (moved < moved_before) & registered.converged & _is_held(registered, least_spread)
+    nearer = (moved < moved_before) & registered.converged & ~may_slide(registered, least_spread)
     kept = unguessed[known] | (moved < REUSE_WITHIN_M * scale) | nearer
     return rows[kept], known[kept]
-
-
-def _is_held(registered: Edges, least_spread: float) -> Bools:
-    """Where (P,) every direction of translation is constrained."""
-    weak, _ = weak_directions(registered, least_spread)
-    return np.asarray(~weak.any(axis=1))

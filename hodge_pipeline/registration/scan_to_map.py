@@ -20,7 +20,7 @@ from hodge_pipeline.registration.sweep_map import (
     usual_share,
 )
 from hodge_pipeline.registration.sweeps import deskewed
-from hodge_pipeline.types import Floats, Floats32, PointCloud
+from hodge_pipeline.types import Floats, PointCloud
 
 LOOSE = 0.002
 """Share of the information on translation that its weakest direction has, below which little tells how far the scanner
@@ -146,7 +146,8 @@ class ScanToMap:
         before, moved_spread, shift_m = self.pose, spread, np.inf
         weak, weakest = np.eye(3), np.zeros(3)  # of the velocity two sweeps of one stamp tell nothing
         predicted = before @ se3.exp(velocity * duration)
-        far_m, rounds = _far_m(cloud.points_in_cam), list[tuple[Step, Latest]]()
+        squares = np.einsum("ni,ni->n", cloud.points_in_cam, cloud.points_in_cam)
+        far_m, rounds = float(np.sqrt(np.quantile(squares, FARTHER))), list[tuple[Step, Latest]]()
         for _ in range(MOST_DESKEWS):
             points = deskewed(cloud, velocity, turn_s / 2).points_in_cam.astype(np.float64)
             guesses = [before @ se3.exp(velocity * duration)]
@@ -189,11 +190,6 @@ class ScanToMap:
             return velocity, spread
         spread = np.linalg.inv(np.linalg.inv(spread) + known)
         return np.concatenate([velocity[:3], velocity[3:] + spread @ known @ beyond]), spread
-
-
-def _far_m(points: Floats32) -> float:
-    """The distance of the farther points (N, 3), at quantile `FARTHER`."""
-    return float(np.sqrt(np.quantile(np.einsum("ni,ni->n", points, points), FARTHER)))
 
 
 def _shift_m(rates: Floats, far_m: float, seconds: float) -> float:

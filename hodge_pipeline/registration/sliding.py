@@ -14,9 +14,8 @@ where GICP slides by whole steps of 1.4 m, the weakest direction has 0.018 to 0.
 
 
 def unheld_steps(edges: Edges, min_spread: float) -> Bools:
-    """Where (P,) consecutive frames leave a direction of translation unconstrained, as before a bare wall."""
-    weak, _ = weak_directions(edges, HELD_SPREADS * min_spread)
-    return np.asarray(weak.any(axis=1) & consecutive(edges))
+    """Where (P,) a step between frames leaves a direction of translation unconstrained, as before a bare wall."""
+    return may_slide(edges, HELD_SPREADS * min_spread) & are_steps(edges)
 
 
 def held_where_sliding(registered: Edges, guesses: Floats, min_spread: float) -> Edges:
@@ -34,13 +33,18 @@ def held_where_sliding(registered: Edges, guesses: Floats, min_spread: float) ->
     return registered.put(rows, i_from_j=guesses[rows] @ se3.exp(twist), iterations=iterations)
 
 
+def may_slide(registered: Edges, min_spread: float) -> Bools:
+    """Where (P,) some direction hardly constrains translation."""
+    return np.asarray(weak_directions(registered, min_spread)[0].any(axis=1))
+
+
 def weak_directions(registered: Edges, min_spread: float) -> tuple[Bools, Floats]:
     """Which directions (P, 3) hardly constrain translation, and the directions as columns (P, 3, 3), in j's axes."""
     values, vectors = np.linalg.eigh(np.nan_to_num(registered.information[:, 3:, 3:]))
     return np.asarray(np.maximum(values, 0.0) < min_spread * values.sum(axis=1, keepdims=True)), vectors
 
 
-def consecutive(registered: Edges) -> Bools:
-    """Where (P,) a pair is of two frames that follow each other, among those that any pair has."""
+def are_steps(registered: Edges) -> Bools:
+    """Where (P,) a pair is a step: of two frames that follow each other, among those that any pair has."""
     rank = np.searchsorted(np.unique(registered.pairs), registered.pairs)
     return np.asarray(np.abs(rank[:, 0] - rank[:, 1]) == 1)

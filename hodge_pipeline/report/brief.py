@@ -40,10 +40,9 @@ def all_notes(report: Report) -> list[str]:
 
 
 def _end(report: Report, folder: str) -> Iterator[str]:
-    if report.stages:
-        wall, cpu = (sum(getattr(stage, name) for stage in report.stages) for name in ("wall_s", "cpu_s"))
+    if (total := report.total) is not None:
         stages = " in the stages" if len(report.stages) > 1 else ""
-        yield from labelled("time", f"{duration(wall)}, {cpu:.1f} CPU s{stages}{peak(report)}")
+        yield from labelled("time", f"{duration(total.wall_s)}, {total.cpu_s:.1f} CPU s{stages}{peak(total)}")
     yield f"{'report':<{LABEL}}{folder}/{PAGE_FILE}"
     command = next(line for line in next_commands(report, folder) if not line.startswith("#"))
     yield f"{'next':<{LABEL}}{command}"

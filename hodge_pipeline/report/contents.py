@@ -277,6 +277,14 @@ class Report:
         return self.scores.scale if self.scores else 1.0
 
     @property
+    def total(self) -> StageRow | None:
+        """The times of all stages added up, and the most memory that one took; None where no stage was measured."""
+        if not self.stages:
+            return None
+        wall_s, cpu_s = (sum(getattr(stage, name) for stage in self.stages) for name in ("wall_s", "cpu_s"))
+        return StageRow("all", wall_s, cpu_s, max(stage.peak_mb for stage in self.stages))
+
+    @property
     def floor_m(self) -> float:
         """The least difference of lengths that the report takes for one: see `MEASURABLE`.
 

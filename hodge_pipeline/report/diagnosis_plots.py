@@ -25,12 +25,8 @@ GAP_SHARE = 0.25
 FEW = 15
 
 
-def draw(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow], has_metres: bool) -> tuple[Picture, ...]:
+def draw(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow], has_metres: bool) -> Iterator[Picture]:
     """Every picture that there are data for."""
-    return tuple(_plots(graph, diagnosis, energy, "m" if has_metres else UNKNOWN_UNIT))
-
-
-def _plots(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow], unit: str) -> Iterator[Picture]:
     if graph.edge_count:
         yield painted(
             "Viewing graph by verdict",
@@ -42,7 +38,7 @@ def _plots(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow], 
             "Edges from above",
             "The frames at their robust poses, seen across their flattest direction, with the edges by verdict; pieces "
             "that nothing sound connects are drawn beside each other.",
-            lambda figure: _above(figure, graph, diagnosis, unit),
+            lambda figure: _above(figure, graph, diagnosis, "m" if has_metres else UNKNOWN_UNIT),
         )
     if energy:
         yield painted(
@@ -126,6 +122,5 @@ def _bars(figure: Figure, rows: Sequence[EnergyRow]) -> None:
             left += shares
         axes.set_title(kind, fontsize=9)
         axes.set_xlabel("%")
-        axes.spines[["top", "right"]].set_visible(False)
     axes.invert_yaxis()
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False, fontsize=8)

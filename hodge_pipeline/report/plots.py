@@ -44,11 +44,6 @@ class PlainNumbers(LogFormatter):
         return f"{x:g}" if super().__call__(x, pos) else ""
 
 
-def draw(report: Report) -> tuple[Picture, ...]:
-    """Every plot that the report has data for, but those of convergence."""
-    return tuple(_plots(report))
-
-
 def draw_convergence(report: Report) -> tuple[Picture, ...]:
     """How the solver came to its result."""
     if not any(report.pictures.convergence.values()) and not report.loops:
@@ -58,7 +53,8 @@ def draw_convergence(report: Report) -> tuple[Picture, ...]:
     return (painted("Convergence", caption, lambda figure: _convergence(figure, report)),)
 
 
-def _plots(report: Report) -> Iterator[Picture]:
+def draw(report: Report) -> Iterator[Picture]:
+    """Every plot that the report has data for, but those of convergence."""
     pictures = report.pictures
     if any(np.isfinite(path.positions).any() for path in pictures.paths):
         caption = f"Seen across its flattest direction{', aligned to the truth' if has_truth(report) else ''}."
@@ -84,14 +80,11 @@ def _style(report: Report, name: str) -> dict[str, Any]:
     fixed = {report.before: 1, report.after: 2}
     if name in fixed:
         return STYLES[fixed[name]]
-    others = [other for other in _names(report) if other not in fixed]
+    scored = () if report.scores is None else report.scores.names
+    names = dict.fromkeys((*(path.name for path in report.pictures.paths), *scored))
+    others = [other for other in names if other not in fixed]
     free = (0, 3, 4, 5)
     return STYLES[free[others.index(name) % len(free)]] if name in others else STYLES[0]
-
-
-def _names(report: Report) -> list[str]:
-    scored = () if report.scores is None else report.scores.names
-    return list(dict.fromkeys((*(path.name for path in report.pictures.paths), *scored)))
 
 
 def _paths(figure: Figure, report: Report) -> None:

@@ -26,6 +26,7 @@ PAPER, GAP = 255, 8
 AMBIENT = 0.55
 FILL_PX = 2
 FRAMING_POINTS = 20_000
+"""A hundred of them lie beyond each side of a picture (`STRAY_PERCENT`)."""
 STRAY_PERCENT = 0.5
 """Percentage of the points that may lie outside a picture at each side."""
 MARGIN = 1.06

@@ -38,7 +38,7 @@ def document(report: Report, folder: str) -> Document:
         (
             Section("The place that changed most", of, pictures=pictures.changed_most, is_large=True),
             Section("What else to look at", lines=tuple(worrying[FIRST:])),
-            Section("Errors and graph", of, pictures=draw(report)),
+            Section("Errors and graph", of, pictures=tuple(draw(report))),
             *(Section.of(table) for table in score_tables(report)),
             Section(
                 "The scene from four sides",
@@ -68,6 +68,6 @@ def _subtitle(report: Report) -> str:
     if graph is not None:
         parts = len(graph.components)
         told.append(f"{counted(graph.edges, 'edge')}, {counted(parts, 'connected part')}")
-    if report.stages:
-        told.append(f"{duration(sum(stage.wall_s for stage in report.stages))}{peak(report)}")
+    if (total := report.total) is not None:
+        told.append(f"{duration(total.wall_s)}{peak(total)}")
     return f"{'; '.join(told)}."

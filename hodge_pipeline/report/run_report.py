@@ -230,5 +230,5 @@ def _pictures(
         stamps_s=np.array([frame.stamp_s for frame in source.frames if is_clocked]),
         changed_most=changed_most(clouds, before, after, last.graph.edges, last.vertex_ids.tolist(), held),
         sides=four_sides(clouds, before, after, component),
-        worst_pairs=worst_pairs(source, worst),
+        worst_pairs=tuple(worst_pairs(source, worst)),
     )

@@ -129,14 +129,10 @@ def sides(scenes: Sequence[raster.Points], views: Mapping[str, raster.View], cap
     )
 
 
-def worst_pairs(source: Source, edges: Sequence[EdgeRow]) -> tuple[Picture, ...]:
+def worst_pairs(source: Source, edges: Sequence[EdgeRow]) -> Iterator[Picture]:
     """The two frames of each of the worst edges side by side; an edge whose images cannot be read has no picture."""
-    return tuple(_worst_pairs(source, edges[:EDGES]))
-
-
-def _worst_pairs(source: Source, edges: Sequence[EdgeRow]) -> Iterator[Picture]:
     frames = {str(frame.frame_id): frame for frame in source.frames}
-    for edge in edges:
+    for edge in edges[:EDGES]:
         shown = images_of([frames[name] for name in (edge.i, edge.j) if name in frames], THUMBNAIL_PX)
         if len(shown) == 2:
             ignored = ", ignored by the solver" if edge.weight <= 0 else ""

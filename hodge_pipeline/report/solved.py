@@ -50,15 +50,10 @@ def _before(solved: SolvedFile) -> dict[str, Floats]:
     return {} if solved.start is None else {"start": solved.start}
 
 
-def _outcome(solved: SolvedFile) -> RefinementSummary:
-    summary = solved.summary()
-    reason = f"{counted(summary['edges'], 'edge')}, {summary['edges_ignored']} of them ignored"
-    return RefinementSummary("worse" if solved.doubt else "solved", solved.headline, reason)
-
-
 def _report(solved: SolvedFile, edges: Edges) -> Report:
     source, graph, solution = solved.source, solved.graph, solved.solution
-    sets = {**_before(solved), "result": solution.world_from_cam}
+    sets, summary = {**_before(solved), "result": solution.world_from_cam}, solved.summary()
+    reason = f"{counted(summary['edges'], 'edge')}, {summary['edges_ignored']} of them ignored"
     return Report(
         title=source.name,
         source=SourceSummary(
@@ -71,7 +66,7 @@ def _report(solved: SolvedFile, edges: Edges) -> Report:
             is_scanner=not source.of_cameras,
         ),
         before="start",
-        refinement=_outcome(solved),
+        refinement=RefinementSummary("worse" if solved.doubt else "solved", solved.headline, reason),
         graph=graph_summary(edges, graph.vertex_ids, solution.component),
         worst_edges=worst_edges(edges, graph.vertex_ids, LISTED),
         stages=(StageRow("solve", solved.wall_s, solved.cpu_s, float("nan")),),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hodge_pipeline.complex.components import in_runs
 from hodge_pipeline.diagnosis.result import UNTESTABLE, VERDICTS, WRONG
-from hodge_pipeline.evaluation.trajectory import AbsoluteError, RelativeError, absolute_error, relative_error
+from hodge_pipeline.evaluation.trajectory import absolute_error, relative_error
 from hodge_pipeline.registration.sliding import unheld_steps
 from hodge_pipeline.report.contents import ComponentRow, EdgeRow, GraphSummary, TrajectoryRow, WrongEdges
 from hodge_pipeline.scene import Round
@@ -48,34 +48,25 @@ def trajectory_rows(
     if component is not None:
         alone = np.bincount(component)[component] == 1
         truth = truth if alone.all() else np.where(alone[:, None, None], np.nan, truth)
-    return tuple(
-        _trajectory_row(
-            name,
-            absolute_error(poses, truth, component),
-            relative_error(poses, truth, delta_frames, component=parts),
-            names,
+    rows = []
+    for name, poses in pose_sets.items():
+        absolute = absolute_error(poses, truth, component)
+        relative = relative_error(poses, truth, delta_frames, component=parts)
+        row = TrajectoryRow(
+            name=name,
+            frames=absolute.frames,
+            left_out=absolute.left_out,
+            ate_rmse_m=absolute.rmse_m,
+            ate_median_m=absolute.median_m,
+            ate_max_m=absolute.max_m,
+            rpe_translation_m=relative.translation_rmse_m,
+            rpe_rotation_deg=relative.rotation_rmse_deg,
+            rpe_delta_frames=relative.delta_frames,
+            worst=str(names[int(np.nanargmax(absolute.per_frame_m))]) if absolute.frames and len(names) else "",
+            degenerate=any(alignment.degenerate for alignment in absolute.alignments),
         )
-        for name, poses in pose_sets.items()
-    )
-
-
-def _trajectory_row(
-    name: str, absolute: AbsoluteError, relative: RelativeError, names: Sequence[object]
-) -> TrajectoryRow:
-    worst = int(np.nanargmax(absolute.per_frame_m)) if absolute.frames and len(names) else -1
-    return TrajectoryRow(
-        name=name,
-        frames=absolute.frames,
-        left_out=absolute.left_out,
-        ate_rmse_m=absolute.rmse_m,
-        ate_median_m=absolute.median_m,
-        ate_max_m=absolute.max_m,
-        rpe_translation_m=relative.translation_rmse_m,
-        rpe_rotation_deg=relative.rotation_rmse_deg,
-        rpe_delta_frames=relative.delta_frames,
-        worst=str(names[worst]) if worst >= 0 else "",
-        degenerate=any(alignment.degenerate for alignment in absolute.alignments),
-    )
+        rows.append(row)
+    return tuple(rows)
 
 
 def _distinct(component: Ints | None, sequence: Sequence[str] | None, count: int) -> Ints:
@@ -154,12 +145,8 @@ def weigh_wrong(last: Round, solver: ConsistencySolver, *, step: Step) -> WrongE
     frames = _shared_frames(last.graph_edges.pairs[wrong], last.vertex_ids)
     solved = solver.solve(last.graph.select(~wrong & (last.solution.weights > 0)), last.world_from_cam)
     moved_m = absolute_error(last.world_from_cam, solved.world_from_cam, solved.component).max_m
-    more = _pieces(solved.component) - _pieces(last.solution.component)
+    more = len(np.unique(solved.component)) - len(np.unique(last.solution.component))
     return WrongEdges(int(wrong.sum()), frames, float(np.nan_to_num(moved_m)), max(more, 0))
-
-
-def _pieces(component: Ints) -> int:
-    return len(np.unique(component))
 
 
 def _shared_frames(pairs: Ints, vertex_ids: NDArray[np.generic]) -> str:

@@ -14,11 +14,6 @@ from hodge_pipeline.report.document import Table
 from hodge_pipeline.types.text import counted
 
 
-def peak_mb(report: Report) -> float:
-    """The most memory that a stage took, NaN where none was measured."""
-    return max(stage.peak_mb for stage in report.stages)
-
-
 def score_tables(report: Report) -> Iterator[Table]:
     """Scores and trajectory errors of each set of poses, where they were measured."""
     if report.refinement is not None and report.refinement.measures:
@@ -239,11 +234,10 @@ def worst_edges_table(report: Report) -> Table:
 
 def stages_table(report: Report) -> Table:
     """What each stage cost, with the total."""
-    rows = [(s.name, f"{s.wall_s:.1f} s", f"{s.cpu_s:.1f} s", number(s.peak_mb, ".0f", " MB")) for s in report.stages]
-    wall, cpu = (sum(getattr(stage, name) for stage in report.stages) for name in ("wall_s", "cpu_s"))
-    rows.append(("all", f"{wall:.1f} s", f"{cpu:.1f} s", number(peak_mb(report), ".0f", " MB")))
+    stages = (*report.stages, *filter(None, [report.total]))
+    rows = tuple((s.name, f"{s.wall_s:.1f} s", f"{s.cpu_s:.1f} s", number(s.peak_mb, ".0f", " MB")) for s in stages)
     caption = "CPU time and peak memory are summed over all processes; a stage that was resumed cost nothing."
-    return Table("Time", ("stage", "wall", "CPU", "peak memory"), tuple(rows), caption)
+    return Table("Time", ("stage", "wall", "CPU", "peak memory"), rows, caption)
 
 
 def number(value: float, form: str, unit: str = "") -> str:

@@ -6,17 +6,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from hodge_pipeline.report.contents import Report
+from hodge_pipeline.report.contents import Report, StageRow
 from hodge_pipeline.report.error_plots import has_truth, offsets
-from hodge_pipeline.report.tables import peak_mb
 from hodge_pipeline.report.verdict import capital
 from hodge_pipeline.types.text import command
 
 
-def peak(report: Report) -> str:
+def peak(total: StageRow) -> str:
     """`, at most 800 MB`; nothing where memory was not measured."""
-    memory = peak_mb(report)
-    return f", at most {memory:.0f} MB" if np.isfinite(memory) else ""
+    return f", at most {total.peak_mb:.0f} MB" if np.isfinite(total.peak_mb) else ""
 
 
 def worst_places(report: Report) -> Iterator[str]:

@@ -14,7 +14,7 @@ from hodge_pipeline.pairs.edits import pair_names
 from hodge_pipeline.review.adding import Candidate
 from hodge_pipeline.review.session import Session
 from hodge_pipeline.review.settle import Judged
-from hodge_pipeline.types import Bools, Floats, Ints, Words
+from hodge_pipeline.types import Bools, Ints, Words
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -93,8 +93,9 @@ def _order(session: Session, query: Query, rows: Ints, failing: Ints) -> Ints:
     residual_m = np.nan_to_num(settled.residual_m[rows], nan=np.inf)
     first_m = np.full(len(edges), np.inf)
     first_m[: len(session.first.residual_m)] = np.nan_to_num(session.first.residual_m, nan=np.inf)
+    shown = np.nan_to_num(edges.probability[rows], nan=0.5).round(2)  # as the page has it, so that equal ones tie
     keys: dict[str, tuple[Any, ...]] = {
-        "score": (-first_m[rows], _rounded(edges.probability[rows]), _ranks(edges.verdict[rows])),
+        "score": (-first_m[rows], shown, _ranks(edges.verdict[rows])),
         "residual": (-residual_m,),
         "turn": (-np.nan_to_num(settled.residual_rad[rows], nan=np.inf),),
         "gap": (-np.abs(pairs[rows, 0] - pairs[rows, 1]),),
@@ -103,11 +104,6 @@ def _order(session: Session, query: Query, rows: Ints, failing: Ints) -> Ints:
     }
     order = np.lexsort(keys[query.sort])
     return order[::-1] if query.descending else order
-
-
-def _rounded(score: Floats) -> Floats:
-    """Scores as the page shows them, so that equal ones tie; one that is unknown counts as undecided."""
-    return np.asarray(np.nan_to_num(score, nan=0.5).round(2))
 
 
 def _ranks(verdict: Words) -> Ints:

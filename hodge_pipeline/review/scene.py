@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -144,8 +143,9 @@ class Scene:
                 (True, "closing", VERDICT_COLOURS[CONSISTENT]),
                 (False, "failing", VERDICT_COLOURS[WRONG]),
             ):
-                around = [_around(one.along) for one in cycles if one.closes == closes]
-                self._lines(f"/cycles/{name}", settled.world_from_cam, _joined(around), colour, 3.5)
+                of_cycles = [np.stack([c.along, np.roll(c.along, -1)], axis=1) for c in cycles if c.closes == closes]
+                sides = np.concatenate([np.zeros((0, 2), np.int64), *of_cycles])
+                self._lines(f"/cycles/{name}", settled.world_from_cam, sides, colour, 3.5)
             scene = self._server.scene
             scene.add_frame("/clouds", show_axes=False, visible=pair is None)
             self._closeup.draw(pair, self._subject.clouds, self._up, self._size)
@@ -286,12 +286,3 @@ def _sampled(clouds: CloudSet | None, world_from_cam: Floats) -> Floats:
     owner = np.searchsorted(clouds.offsets, rows, side="right") - 1
     points = se3.transform(world_from_cam[owner], np.asarray(clouds.points[rows], float)[:, None])[:, 0]
     return points[np.isfinite(points).all(axis=1)]
-
-
-def _around(along: Ints) -> Ints:
-    """The sides (n, 2) of a cycle by its vertices (n,)."""
-    return np.stack([along, np.roll(along, -1)], axis=1)
-
-
-def _joined(parts: Sequence[Ints]) -> Ints:
-    return np.concatenate([np.zeros((0, 2), np.int64), *parts])

@@ -16,7 +16,7 @@ from hodge_pipeline.pairs.edits import ENABLED, REGISTERED, RIGHT, History, join
 from hodge_pipeline.rounds.more import Placed, register_more
 from hodge_pipeline.rounds.one_round import EDITED, Registered, Work
 from hodge_pipeline.scene import Round
-from hodge_pipeline.start.unordered.pieces import laid_apart
+from hodge_pipeline.start.unordered.folds import laid_apart
 from hodge_pipeline.store.workspace import EDITS_FILE
 from hodge_pipeline.types import Edges, Floats, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, HELD_OUT, REJECTED, USED

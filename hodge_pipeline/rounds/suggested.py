@@ -17,7 +17,7 @@ from hodge_pipeline.rounds.one_round import Registered, Work
 from hodge_pipeline.rounds.suggestions import suggest_pairs
 from hodge_pipeline.scene import Round
 from hodge_pipeline.stages import Step
-from hodge_pipeline.start.unordered.pieces import laid_apart
+from hodge_pipeline.start.unordered.folds import laid_apart
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Source, ViewGraph
 from hodge_pipeline.types.edges import REJECTED
 from hodge_pipeline.types.notes import Note

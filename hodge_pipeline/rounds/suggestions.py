@@ -64,7 +64,8 @@ def suggest_pairs(
     if overlapping is None:
         overlapping = np.concatenate([_missing_sides(graph.edges[kept], count), _near(diagnosis)])
     inside = diagnosis.piece[overlapping[:, 0]] == diagnosis.piece[overlapping[:, 1]]
-    pairs = np.concatenate([overlapping[inside], _across_pieces(diagnosis.piece)])
+    breaks = np.flatnonzero(diagnosis.piece[1:] != diagnosis.piece[:-1])
+    pairs = np.concatenate([overlapping[inside], np.stack([breaks, breaks + 1], axis=1)])
     low, high = np.sort(pairs, axis=1).T
     keys = np.unique(low * count + high)
     pairs = np.stack([keys // max(count, 1), keys % max(count, 1)], axis=1)
@@ -95,11 +96,6 @@ def _near(diagnosis: Diagnosis) -> Ints:
         _, found = cKDTree(diagnosis.world_from_cam[rows, :3, 3]).query(diagnosis.world_from_cam[rows, :3, 3], number)
         parts.append(np.stack([np.repeat(rows, number), rows[found.ravel()]], axis=1))
     return np.concatenate(parts)
-
-
-def _across_pieces(piece: Ints) -> Ints:
-    breaks = np.flatnonzero(piece[1:] != piece[:-1])
-    return np.stack([breaks, breaks + 1], axis=1).astype(np.int64)
 
 
 def _contains(edges: Ints, pairs: Ints, count: int) -> Bools:

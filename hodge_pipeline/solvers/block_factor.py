@@ -53,21 +53,14 @@ def side_by_side(blocks: Floats) -> Floats:
     return blocks.transpose(0, 2, 1, 3).reshape(count, size, k * size)
 
 
-def eliminate(
-    plan: Elimination, matrix: bsr_matrix, factorise_core: Callable[[csc_matrix], Callable[[Floats], Floats]]
-) -> BlockFactor:
-    """The factor of a symmetric positive definite block matrix whose rows are in the plan's order."""
-    return eliminate_blocks(plan, *_unpacked(plan, matrix), factorise_core)
-
-
 def eliminate_blocks(
     plan: Elimination,
     diagonal: Floats,
     rows: Floats,
     factorise_core: Callable[[csc_matrix], Callable[[Floats], Floats]],
 ) -> BlockFactor:
-    """The factor of the matrix of these blocks: `diagonal (n, s, s)`, and `rows (slots, s, s)` above it; both are
-    overwritten.
+    """The factor of the positive definite matrix of these blocks: `diagonal (n, s, s)`, and `rows (slots, s, s)` above
+    it; both are overwritten.
     """
     size = diagonal.shape[-1]
     flat = diagonal.reshape(-1, size * size), rows.reshape(-1, size * size)
@@ -79,8 +72,8 @@ def eliminate_blocks(
     return BlockFactor(plan, diagonal[: plan.core], rows[:end], solve_core)
 
 
-def _unpacked(plan: Elimination, matrix: bsr_matrix) -> tuple[Floats, Floats]:
-    """The diagonal blocks and those above the diagonal, with zeros for the fill."""
+def unpacked(plan: Elimination, matrix: bsr_matrix) -> tuple[Floats, Floats]:
+    """The diagonal blocks of a symmetric matrix in the plan's order, and those above it, with zeros for the fill."""
     size, n = matrix.blocksize[0], plan.size
     at = np.repeat(np.arange(n), np.diff(matrix.indptr))
     columns = matrix.indices.astype(np.int64)

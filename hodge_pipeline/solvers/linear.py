@@ -10,7 +10,7 @@ from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
 from hodge_pipeline.errors import GraphError
-from hodge_pipeline.solvers.block_factor import by_columns, eliminate
+from hodge_pipeline.solvers.block_factor import by_columns, eliminate_blocks, unpacked
 from hodge_pipeline.solvers.elimination import Elimination, Ordering
 from hodge_pipeline.types import Floats
 
@@ -58,7 +58,7 @@ def factorise_blocks(plan: Elimination, matrix: bsr_matrix) -> Factor:
     if not plan.groups:
         return factorise(by_columns(matrix), "NATURAL")
     try:
-        found = eliminate(plan, matrix, lambda left: factorise(left, "NATURAL").solve)
+        found = eliminate_blocks(plan, *unpacked(plan, matrix), lambda left: factorise(left, "NATURAL").solve)
     except np.linalg.LinAlgError as error:
         raise GraphError(_singular(matrix.shape[0])) from error
     return Factor(int(matrix.shape[0]), found.solve)

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as stage
 
-from hodge_pipeline.complex.checks import NO_EDGES, check_rows
+from hodge_pipeline.complex.checks import NO_EDGES, check_fixed
 from hodge_pipeline.complex.components import describe_components
 from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.errors import GraphError
@@ -120,7 +120,7 @@ def _check_options(
     check_choice("initial", initial, InitialName)
     if not time_limit_s > 0:
         raise GraphError(f"time_limit_s is {time_limit_s:g}: expected seconds above zero")
-    check_rows(graph.fixed if fixed is None else np.asarray(fixed), graph.vertex_count, "fixed")
+    check_fixed(graph.fixed if fixed is None else np.asarray(fixed), graph.vertex_count)
     if start is None and (initial == "given" or (fixed is not None and len(fixed))):
         raise GraphError("fixed vertices and a given initial guess need start poses: pass start")
 

@@ -78,7 +78,8 @@ def _minimum(
     at_once: bool,
 ) -> Descent:
     """The descent from `begin`, which may end at a saddle; `at_once`: try the full objective first, where `full`."""
-    alone = full_at_once(setup.problem)
+    problem = setup.problem  # where steps are by factorisations from the first the isotropic objective is no help
+    alone = problem.structure.precondition is None and not cg_first(problem) and steps_are_direct(problem)
     if full and (at_once or alone):
         objective, least_won = full_objective(setup), 0.0 if alone else LEAST_GAIN_RATIO
         found = descend(objective, objective.at(*begin), limits, setup.rounding, watch, least_won=least_won)
@@ -87,7 +88,7 @@ def _minimum(
         del objective, found
     loose = max(limits.relative_tolerance, WARM_START_TOLERANCE)
     warming = Limits(limits.max_iterations // 2, loose, limits.deadline_s) if full else limits
-    warm = descend_isotropic(setup.problem, begin, warming, setup.rounding, watch)
+    warm = descend_isotropic(problem, begin, warming, setup.rounding, watch)
     if not full:
         return warm
     point, steps, cg_steps = (warm.point.rotations, warm.point.translations), len(warm.costs) - 1, warm.cg_steps
@@ -119,11 +120,6 @@ def joint_at_once(problem: Problem) -> bool:
     if problem.structure.precondition is not None:
         return True
     return problem.free_count > CG_FIRST_TO and steps_are_direct(problem)
-
-
-def full_at_once(problem: Problem) -> bool:
-    """Whether the full objective's steps are by factorisations from the first: then the isotropic one is no help."""
-    return problem.structure.precondition is None and not cg_first(problem) and steps_are_direct(problem)
 
 
 def full_objective(setup: Setup) -> FullObjective:

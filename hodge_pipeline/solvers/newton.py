@@ -11,7 +11,9 @@ from typing import Protocol
 from hodge_pipeline.types import Floats
 
 SUFFICIENT_DECREASE = 1e-4
+"""Armijo's constant, as Nocedal and Wright have it."""
 MAX_HALVINGS = 40
+"""To a trillionth of the step, whose change of the cost is rounding."""
 CG_LIMIT_REACHED = "limit of CG steps reached"
 TIME_LIMIT_REACHED, ITERATION_LIMIT_REACHED = "time limit reached", "iteration limit reached"
 ROUNDING_REACHED = "no further decrease within rounding"

@@ -23,6 +23,7 @@ from hodge_pipeline.solvers.rotations import exponential
 from hodge_pipeline.types import Bools, Floats, Ints
 
 SAME_RATIO = 1e-13
+"""Relative: some hundred roundings, as a product of stated numbers may have."""
 
 CHUNK = 1 << 12
 """Edges whose blocks are made at a time: they stay in the cache, and memory never holds those of all edges."""

@@ -14,6 +14,7 @@ PLANAR_AXES = np.array([2, 3, 4])
 """(θ, x, y) in (φ, ρ)."""
 OUT_OF_PLANE = np.array([0, 1, 5])
 PLANAR_TOLERANCE = 1e-12
+"""What rounding leaves out of the plane; motions that were lifted from it have zeros."""
 INDEFINITE_TOLERANCE = 1e-9
 """Share of the largest eigenvalue up to which a negative one is rounding."""
 EARTH_M = 1.2742e7

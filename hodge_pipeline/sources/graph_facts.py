@@ -29,6 +29,7 @@ def graph_facts(graph: ViewGraph, oddities: list[str], unit: str = METRES) -> di
     component = connected_components(simple, count)
     sizes = np.bincount(component)
     degree = np.bincount(simple.ravel(), minlength=count)
+    repeats = np.unique(np.sort(between, axis=1), axis=0, return_counts=True)[1]
     _note_shape(graph, len(between) - len(simple), sizes, degree, oddities)
     facts: dict[str, Any] = {
         "vertices": count,
@@ -39,7 +40,7 @@ def graph_facts(graph: ViewGraph, oddities: list[str], unit: str = METRES) -> di
         "vertices of the largest": sizes[:LISTED].tolist(),
         "isolated vertices": int((degree == 0).sum()),
         "degree, least median most": [int(degree.min()), float(np.median(degree)), int(degree.max())],
-        "pairs with more than one edge": _repeated(between),
+        "pairs with more than one edge": int((repeats > 1).sum()),
         **_cycle_facts(simple, count, len(sizes)),
     }
     if len(graph.fixed):
@@ -94,11 +95,6 @@ def _information_facts(graph: ViewGraph, oddities: list[str]) -> dict[str, Any]:
 
 def _spread(values: Floats) -> list[float] | None:
     return [float(f"{find(values):.6g}") for find in (np.min, np.median, np.max)] if values.size else None
-
-
-def _repeated(between: Ints) -> int:
-    counts = np.unique(np.sort(between, axis=1), axis=0, return_counts=True)[1]
-    return int((counts > 1).sum())
 
 
 def _note_shape(graph: ViewGraph, parallel: int, sizes: Ints, degree: Ints, oddities: list[str]) -> None:

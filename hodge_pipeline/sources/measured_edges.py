@@ -8,16 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guess_reader
-from hodge_pipeline.stages import FrameReader
+from hodge_pipeline.stages import OPTIONS, FrameReader
 from hodge_pipeline.types import Bools, Edges, Frame, Ints, Source, ViewGraph, number_of
 from hodge_pipeline.types.text import counted
-
-OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 
 
 @dataclass(frozen=True, config=OPTIONS)

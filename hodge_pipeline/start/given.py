@@ -23,6 +23,7 @@ from hodge_pipeline.scene import (
     KeyFrames,
     Round,
     Scene,
+    choose_key_frames,
     has_truth,
     key_source,
     own_trajectory,
@@ -34,12 +35,11 @@ from hodge_pipeline.scene import (
 )
 from hodge_pipeline.se3 import spread_correction
 from hodge_pipeline.sources.inspect import guess_reader
-from hodge_pipeline.stages import Steps, Workers
+from hodge_pipeline.stages import OPTIONS, Steps, Workers
 from hodge_pipeline.start.at_stamps import with_landmarks_at_stamps
-from hodge_pipeline.start.choose_key_frames import choose_key_frames
 from hodge_pipeline.start.clouds import make_clouds
 from hodge_pipeline.start.match_poses import Match, Matched, match_poses, own_poses
-from hodge_pipeline.start.odometry import OPTIONS, chain
+from hodge_pipeline.start.odometry import chain
 from hodge_pipeline.start.sweep_times import deskewed_along
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Source, Trajectory
 from hodge_pipeline.types.notes import Note, notes_of

@@ -21,8 +21,8 @@ from hodge_pipeline.registration.odometry import REACHES_APART, Odometry, chaine
 from hodge_pipeline.registration.tracking.blocks import BlockRows, TrackedBlocks
 from hodge_pipeline.registration.tracking.bridging import bridge
 from hodge_pipeline.registration.tracking.focal import estimate_focal
+from hodge_pipeline.registration.tracking.frame import find_repeats
 from hodge_pipeline.registration.tracking.readout import estimate_readout
-from hodge_pipeline.registration.tracking.repeats import find_repeats
 from hodge_pipeline.registration.tracking.shutter import velocities
 from hodge_pipeline.registration.tracking.sightings import views
 from hodge_pipeline.registration.tracking.smoothing import VIDEO_STEP_S
@@ -38,9 +38,9 @@ from hodge_pipeline.scene import (
     stamps_of,
     vertex_ids,
 )
-from hodge_pipeline.stages import Advance, Step, Steps, Workers
+from hodge_pipeline.stages import OPTIONS, Advance, Step, Steps, Workers
 from hodge_pipeline.start.at_stamps import landmarks_at_stamps, other_readout
-from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
+from hodge_pipeline.start.odometry import OdometryStart
 from hodge_pipeline.store.codec import CLOUDS
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, Source
 from hodge_pipeline.types.notes import Note, notes_of

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path, PurePath
 
 import numpy as np
@@ -99,21 +99,11 @@ def fixes_of(positions: Positions, options: PositionOptions, scene: Scene, steps
 def _rows_by_name(names: Words, frames: Sequence[Frame]) -> Ints:
     """The row of the frame that each name means, -1 for none: by its id, its file's name, or its number."""
     rows: dict[str, int] = {}
-    for spelling in (_number, _stem, _file, str):  # the most exact one last: it wins
+    spellings = (str, lambda name: PurePath(name).name, lambda name: PurePath(name).stem, _number)
+    for spelling in reversed(spellings):  # the most exact one last: it wins
         rows |= {spelling(str(frame.frame_id)): row for row, frame in enumerate(frames)}
-    return np.array([_row(name, rows) for name in names.tolist()], np.int64)
-
-
-def _row(name: str, rows: Mapping[str, int]) -> int:
-    return next((rows[key(name)] for key in (str, _file, _stem, _number) if key(name) in rows), -1)
-
-
-def _file(name: str) -> str:
-    return PurePath(name).name
-
-
-def _stem(name: str) -> str:
-    return PurePath(name).stem
+    found = (next((rows[key(name)] for key in spellings if key(name) in rows), -1) for name in names.tolist())
+    return np.array(list(found), np.int64)
 
 
 def _number(name: str) -> str:

@@ -100,13 +100,9 @@ def match_poses(trajectory: Trajectory, frames: Sequence[Frame], match: Match, m
 def _matched(how: str, trajectory: Trajectory, frames: Sequence[Frame], max_gap_s: float) -> Matched | None:
     """The poses matched in one way, None where it does not apply."""
     if how == "stamp":
-        return _by_stamp(trajectory, frames, max_gap_s)
+        stamps = np.array([frame.stamp_s for frame in frames], float)
+        return Matched(stamps, trajectory.stamps_s, se3.poses_at(trajectory, stamps, max_gap_s), "stamp")
     return _by_number(trajectory, frames) if how == "number" else _by_row(trajectory, frames)
-
-
-def _by_stamp(trajectory: Trajectory, frames: Sequence[Frame], max_gap_s: float) -> Matched:
-    stamps = np.array([frame.stamp_s for frame in frames], float)
-    return Matched(stamps, trajectory.stamps_s, se3.poses_at(trajectory, stamps, max_gap_s), "stamp")
 
 
 def _by_number(trajectory: Trajectory, frames: Sequence[Frame]) -> Matched | None:

@@ -6,7 +6,7 @@ from dataclasses import fields
 from typing import Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline import se3
@@ -18,7 +18,7 @@ from hodge_pipeline.registration.odometry_path import drift_of
 from hodge_pipeline.registration.tracking.shutter import velocities
 from hodge_pipeline.scene import START, Closed, KeyFrames, Round, Scene, key_source, sequences_of, stamps_of, vertex_ids
 from hodge_pipeline.solvers.poisson import PoissonSolver
-from hodge_pipeline.stages import Step, Steps, Workers
+from hodge_pipeline.stages import OPTIONS, Step, Steps, Workers
 from hodge_pipeline.start.at_stamps import with_landmarks_at_stamps
 from hodge_pipeline.start.clouds import make_clouds, with_landmarks
 from hodge_pipeline.start.unordered.join import join_parts
@@ -27,8 +27,6 @@ from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.start.unordered.start import uses_images
 from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, Source
 from hodge_pipeline.types.notes import Note, notes_of
-
-OPTIONS = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 
 
 @dataclass(frozen=True, config=OPTIONS)

@@ -34,16 +34,16 @@ from hodge_pipeline.registration.sweeps import (
 from hodge_pipeline.scene import (
     KeyFrames,
     Scene,
+    choose_key_frames,
     is_clock,
     sequence_numbers,
     sequences_of,
     stamps_of,
     vertex_ids,
 )
-from hodge_pipeline.stages import Advance, Step, Steps, Workers
-from hodge_pipeline.start.choose_key_frames import choose_key_frames
+from hodge_pipeline.stages import OPTIONS, Advance, Step, Steps, Workers
 from hodge_pipeline.start.clouds import make_clouds
-from hodge_pipeline.start.odometry import OPTIONS, OdometryStart
+from hodge_pipeline.start.odometry import OdometryStart
 from hodge_pipeline.start.sweep_reading import (
     LEFT_OUT,
     NO_CLOCK_S,

@@ -198,7 +198,8 @@ def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool, refusal
     if path.exists():
         if _is_text(path, text):
             return
-        if not overwrite and _has_stages(folder / kind):
+        is_begun = (folder / kind).is_dir() and any((folder / kind).iterdir())
+        if not overwrite and is_begun:  # a run that failed before its first stage may be overwritten
             change = _first_change(yaml_file.read(path).data, recipe)
             raise WorkspaceError(f"{folder}: {refusal.replace('{change}', change)}")
     elif any(entry.name != LOCK_FILE for entry in folder.iterdir()):
@@ -213,11 +214,6 @@ def _is_text(path: Path, text: str) -> bool:
         return read_input(path) == text.encode()
     except OSError as error:
         raise WorkspaceError(f"{path}: cannot be read ({error.strerror}): remove it, or give another --out") from error
-
-
-def _has_stages(stages: Path) -> bool:
-    """Whether a stage was begun: a run that failed before its first stage may be overwritten."""
-    return stages.is_dir() and any(stages.iterdir())
 
 
 def _first_change(old: Any, new: Any, key: str = "") -> str:

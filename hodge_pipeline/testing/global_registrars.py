@@ -8,13 +8,11 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.stages import GlobalRegistrar
-from hodge_pipeline.testing.stage import Contract, nothing, off_by, room, seen_from
+from hodge_pipeline.testing.stage import PAIR, TURNED, Contract, nothing, off_by, room, seen_from
 from hodge_pipeline.types import Match, PointCloud
 
-PAIR = (2, 4)
 ROUGH = 0.05, 0.1
 """Radians and metres from which every registrar finds the motion."""
-TURNED = se3.exp(np.array([0.4, 1.1, -2.0, 3.0, -1.0, 2.0]))
 
 
 def _matched(registrar: GlobalRegistrar, target: PointCloud, source: PointCloud) -> Match:

@@ -12,14 +12,11 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.executors.local import LocalExecutor
 from hodge_pipeline.stages import Registrar
-from hodge_pipeline.testing.stage import Contract, nothing, off_by, room, seen_from
+from hodge_pipeline.testing.stage import PAIR, TURNED, Contract, nothing, off_by, room, seen_from
 from hodge_pipeline.types import Floats, PointCloud, Registration
 
-PAIR = (2, 4)
-"""Two views of the room 10 cm and 5 degrees apart, as far as every registrar's guess may be off."""
 EXACT = 0.003, 0.01
 """Radians and metres that two clouds of a 4 cm grid leave; the guess is off by ten times as much."""
-TURNED = se3.exp(np.array([0.4, 1.1, -2.0, 3.0, -1.0, 2.0]))
 SLIDES = 0.02
 """The weakest direction's share of the information on translation, below which acceptance rejects a pair."""
 

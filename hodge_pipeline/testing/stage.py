@@ -19,6 +19,10 @@ IS_A_STAGE = "is a stage"
 FRAMES, TURNS, WIDTH, HEIGHT = 8, 0.02, 320, 240
 """Neighbours are up to 6 cm and 4 degrees apart; the camera goes there and back."""
 CLOUD_VOXEL_M, LANDMARKS = 0.04, 500
+PAIR = (2, 4)
+"""Two views of the room 10 cm and 5 degrees apart, as far as every registrar's guess may be off."""
+TURNED = se3.exp(np.array([0.4, 1.1, -2.0, 3.0, -1.0, 2.0]))
+"""Other axes of a cloud, far from its own."""
 
 
 def check_stage(stage: object) -> None:

@@ -1,4 +1,6 @@
-"""Names for the types of arrays, rows chosen from them, pixels of another size of image, and root mean squares."""
+"""Names for the types of arrays, rows chosen from them, pixels of another size of image, root mean squares, and keys of
+the cells of a lattice.
+"""
 
 from typing import TypeAlias
 
@@ -11,6 +13,11 @@ Ints: TypeAlias = NDArray[np.int64]
 Bools: TypeAlias = NDArray[np.bool_]
 Bytes: TypeAlias = NDArray[np.uint8]
 Words: TypeAlias = NDArray[np.str_]
+
+AXIS_BITS = 21
+"""Of an index of a cell: three of them fill 63 bits, and the sign stays free."""
+REACH = 1 << (AXIS_BITS - 1)
+"""Indices from -REACH to REACH - 1 have a key: a million cells to each side."""
 
 
 def evenly(available: int, most: int) -> Ints:
@@ -38,3 +45,15 @@ def groups(labels: Ints) -> list[tuple[int, Ints]]:
     order = np.argsort(labels, kind="stable")
     values, begin = np.unique(labels[order], return_index=True)
     return list(zip(values.tolist(), np.split(order, begin[1:]), strict=True))
+
+
+def keys_of_cells(cells: Ints) -> Ints:
+    """One key (N,) for each of the cells (N, 3), whose indices are within `REACH`: these in 64 bits, in their order."""
+    shifted = cells + REACH
+    return np.asarray((shifted[:, 0] << 2 * AXIS_BITS) | (shifted[:, 1] << AXIS_BITS) | shifted[:, 2])
+
+
+def cells_of_keys(keys: Ints) -> Ints:
+    """The cells (N, 3) that have these keys (N,)."""
+    mask = (1 << AXIS_BITS) - 1
+    return np.stack([keys >> 2 * AXIS_BITS, (keys >> AXIS_BITS) & mask, keys & mask], axis=1) - REACH

@@ -159,6 +159,11 @@ def _graph(count: Callable[[GraphSummary], int]) -> Quantity:
     return lambda report: None if report.graph is None else count(report.graph)
 
 
+def _total(what: str) -> Quantity:
+    """A field of what all stages took."""
+    return lambda report: None if report.total is None else getattr(report.total, what) or None
+
+
 _QUANTITIES: tuple[tuple[str, Quantity, bool], ...] = (
     ("error of the trajectory (ATE)", _error("ate_rmse_m"), True),
     ("… of the odometry", _error("ate_rmse_m", "odometry"), True),
@@ -169,9 +174,9 @@ _QUANTITIES: tuple[tuple[str, Quantity, bool], ...] = (
     ("edges ignored by the solver", _graph(lambda graph: graph.edges_ignored), False),
     ("pairs rejected", _graph(lambda graph: sum(graph.rejected.values())), False),
     ("connected parts", _graph(lambda graph: len(graph.components)), False),
-    ("time, s", lambda report: sum(stage.wall_s for stage in report.stages) or None, False),
-    ("CPU time, s", lambda report: sum(stage.cpu_s for stage in report.stages) or None, False),
-    ("peak memory, MB", lambda report: max((stage.peak_mb for stage in report.stages), default=None), False),
+    ("time, s", _total("wall_s"), False),
+    ("CPU time, s", _total("cpu_s"), False),
+    ("peak memory, MB", _total("peak_mb"), False),
 )
 """Label, quantity, and whether it is a length in metres."""
 
@@ -262,7 +267,7 @@ def _page(comparison: Comparison, models: tuple[Model | None, Model | None]) -> 
             Section.of(replace(measured, rows=numbers)),
             Section.of(options),
             Section("The models from four sides", f"Left: {a}. Right: {b}.", pictures=_sides(comparison, models)),
-            Section("Trajectories", pictures=draw(_paths(comparison))),
+            Section("Trajectories", pictures=tuple(draw(_paths(comparison)))),
         ),
     )
 

@@ -190,7 +190,7 @@ def _overlapping(subject: DiagnosisSubject, found: Diagnosis) -> Ints | None:
     """The pairs (P, 2) of a run whose frames overlap at the robust poses; None without frames and clouds."""
     if subject.clouds is None or not subject.frames:
         return None
-    from hodge_pipeline.start.unordered.pieces import laid_apart
+    from hodge_pipeline.start.unordered.folds import laid_apart
 
     poses = laid_apart(found.piece, found.world_from_cam, subject.clouds)
     return subject.suggestions.among.propose(subject.frames, subject.clouds, poses).pairs

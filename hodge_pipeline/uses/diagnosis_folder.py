@@ -53,7 +53,7 @@ def _page(diagnosed: Diagnosed) -> PageContents:
         diagnosis=found,
         advice=diagnosed.advice,
         energy=diagnosed.energy,
-        plots=draw(subject.graph, found, diagnosed.energy, subject.has_metres),
+        plots=tuple(draw(subject.graph, found, diagnosed.energy, subject.has_metres)),
         edges=pictures,
         suggestions=diagnosed.suggestions,
         commands=diagnosed.commands,

@@ -17,8 +17,15 @@ from hodge_pipeline.registry import plugin_errors
 from hodge_pipeline.report import run_files
 from hodge_pipeline.run_folder import Run, check_layout, end
 from hodge_pipeline.sources.colour_on_depth import image_doubts, usable_colour
-from hodge_pipeline.sources.lacking import check_measurable, lacking
-from hodge_pipeline.sources.opening import Fingerprints, changed_since, fingerprints, open_with_reader, remembered
+from hodge_pipeline.sources.opening import (
+    Fingerprints,
+    changed_since,
+    check_measurable,
+    fingerprints,
+    lacking,
+    open_with_reader,
+    remembered,
+)
 from hodge_pipeline.start.truth import with_truth
 from hodge_pipeline.store.log import logging_to
 from hodge_pipeline.store.progress import Watcher

@@ -11,7 +11,7 @@ from hodge_pipeline.complex.checks import check_motions
 from hodge_pipeline.errors import GraphError, SourceError
 from hodge_pipeline.recipe.binding import stage_of
 from hodge_pipeline.stages import Registrar
-from hodge_pipeline.types import Bytes, Edges, Floats, Floats32, Ints, PointCloud, Registration
+from hodge_pipeline.types import Edges, Floats, Floats32, Ints, PointCloud, Registration
 
 
 class Open3dPoints(Protocol):
@@ -86,15 +86,12 @@ def _cloud(given: Cloud, row: int) -> PointCloud:
     if points.ndim != 2 or points.shape[1] != 3:
         raise SourceError(f"cloud {row} has the shape {points.shape}: expected points (N, 3), in metres")
     normals, colours = (_column(given, name, len(points)) for name in ("normals", "colors"))
-    return PointCloud(points, normals, None if colours is None else _bytes(colours))
+    return PointCloud(
+        points, normals, None if colours is None else np.clip(np.round(colours * 255), 0, 255).astype(np.uint8)
+    )
 
 
 def _column(given: Any, name: str, count: int) -> Floats32 | None:
     """A column (N, 3) of Open3D's cloud; None where it has none."""
     values = np.asarray(getattr(given, name, ()), np.float32)
     return values if count and values.shape == (count, 3) else None
-
-
-def _bytes(shares: Floats32) -> Bytes:
-    """Colours from [0, 1] as 8 bits."""
-    return np.clip(np.round(shares * 255), 0, 255).astype(np.uint8)

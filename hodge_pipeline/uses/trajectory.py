@@ -16,14 +16,16 @@ from hodge_pipeline.recipe.schema import load_recipe
 from hodge_pipeline.refine.guard import Decision
 from hodge_pipeline.refine.open3d_objects import poses_of, with_poses
 from hodge_pipeline.report.contents import Report
-from hodge_pipeline.sources.inspect import guess_reader
+from hodge_pipeline.sources.inspect import guess_reader, guesses
 from hodge_pipeline.store.progress import Watcher
 from hodge_pipeline.types import Bytes, Camera, Floats, Floats32, Frame, Source
 from hodge_pipeline.uses.recipe_run import run as recipe_run
-from hodge_pipeline.uses.refinement_recipe import recipe_for, recipe_of
 
 Array = TypeVar("Array")
 
+RECIPE, SCANS = "slam_refine", "slam_refine_scans"
+CALIBRATED = {"tum": "slam_refine_tum"}
+"""Recipes for the readers of formats whose depth and colour are calibrated to each other, where landmarks measure."""
 FARTHEST_M = 200.0
 """Median depth that no sensor has; a room in millimetres has 1000 and more."""
 
@@ -107,6 +109,25 @@ def refine_trajectory(
         return RefinedTrajectory(poses, decision, run.report)
     found = run.refined.world_from_cam
     return RefinedTrajectory(with_poses(poses, found) if open3d else found, decision, run.report)
+
+
+def recipe_for(frames: Path, source: Source | None = None) -> str:
+    """The name of the recipe that refines poses of these frames, by their format, or by what their frames hold.
+
+    `source`: the opened frames, if they are open already.
+    """
+    found = guesses(frames) if frames.exists() else []
+    if not found:
+        return RECIPE
+    if found[0].name in CALIBRATED:
+        return CALIBRATED[found[0].name]
+    return recipe_of((source or guess_reader(frames, found).open(frames)).frames)
+
+
+def recipe_of(frames: Sequence[Frame]) -> str:
+    """The recipe that refines poses of these frames in memory."""
+    has_scans = any(frame.read_points is not None for frame in frames)
+    return SCANS if has_scans and all(frame.camera is None for frame in frames) else RECIPE
 
 
 def _source(frames: Path | str | Sequence[Frame], poses: Floats) -> Source:

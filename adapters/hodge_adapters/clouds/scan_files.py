@@ -50,7 +50,7 @@ class Scan:
     world_from_scan: Floats | None
 
 
-def las_corner(paths: Sequence[Path], units_per_metre: float, *, is_all: bool = True) -> Corner | None:
+def las_corner(paths: Sequence[Path], units_per_metre: float, *, is_all: bool) -> Corner | None:
     """The whole metres in the middle of those of these files that can be opened, in their units; zero where zero is
     nearer to them than they are large: these are in a scanner's axes.
 

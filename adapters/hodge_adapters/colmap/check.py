@@ -201,7 +201,8 @@ def _check_lines(path: Path) -> None:
         )
     if path.stem == "images":
         for line, text, observations in _image_lines(path):
-            if not _is_pose(text):
+            words = text.split(maxsplit=9)
+            if len(words) != 10 or to_floats(words[:9]) is None:
                 hint = ", with blanks instead of commas" if "," in text else ""
                 raise _fault(path, line, text, f"IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME{hint}")
             if len(observations.split()) % 3:
@@ -222,11 +223,6 @@ def _image_lines(path: Path) -> Iterator[tuple[int, str, str]]:
             yield line, text, next(numbered, (0, ""))[1]
 
 
-def _is_pose(text: str) -> bool:
-    words = text.split(maxsplit=9)
-    return len(words) == 10 and to_floats(words[:9]) is not None
-
-
 def _is_rig(words: list[str]) -> bool:
     at, sensors = 4, 1
     while at < len(words):
@@ -235,10 +231,6 @@ def _is_rig(words: list[str]) -> bool:
         at += 10 if words[at + 2] == "1" else 3
         sensors += 1
     return at == len(words) and words[1] == str(sensors) and words[2] in _SENSORS
-
-
-def _is_frame(words: list[str]) -> bool:
-    return len(words) > 9 and words[9].isdecimal() and len(words) == 10 + 3 * int(words[9][:9])
 
 
 _LINES: Mapping[str, tuple[Callable[[list[str]], bool], str]] = {
@@ -253,7 +245,7 @@ _LINES: Mapping[str, tuple[Callable[[list[str]], bool], str]] = {
         "with HAS_POSE and, where that is 1, QW QX QY QZ TX TY TZ",
     ),
     "frames": (
-        _is_frame,
+        lambda words: len(words) > 9 and words[9].isdecimal() and len(words) == 10 + 3 * int(words[9][:9]),
         "FRAME_ID RIG_ID QW QX QY QZ TX TY TZ NUM_DATA_IDS and so many triples of SENSOR_TYPE SENSOR_ID DATA_ID",
     ),
 }

@@ -22,9 +22,11 @@ from hodge_pipeline.types import Floats, PositionPriors
 from hodge_pipeline.types.text import counted
 
 FEWEST = 3
+"""A similarity has seven unknowns, three a position."""
 LEAST_AGREEING, TRIALS, REFITS = 0.5, 300, 5
 """Share of the positions; trials of three each: with half of them wrong, one of 8 has three right ones."""
 INLIER_SIGMAS = 3.0
+"""One Gaussian error of 370 is larger."""
 DRIFT = 0.03
 """Of the extent of the positions: a model may have drifted by so much and still be placed by most of them."""
 SPREAD_SIGMAS = 3.0

@@ -13,6 +13,7 @@ from hodge_pipeline.types import Bools, Floats, Ints
 from hodge_pipeline.types.arrays import evenly
 
 MAX_ERROR_PX = 4.0
+"""COLMAP's default for two views."""
 LEAST_ERROR_PX = 0.25
 """A keypoint is never better than this, however well the residuals fit."""
 REFINEMENTS = 10
@@ -20,6 +21,7 @@ INDEPENDENT_POINTS = 50
 """Neighbouring keypoints share the errors of the lens model: more of them than this are no more information."""
 LEAST_SCALE_ERROR = 1e-3
 SCALE_PAIRS = 512
+"""By so many a median is known to 6 % of the spread."""
 START_MATCHES = 500
 """Of many matches, so many evenly serve to begin with; all of them refine it."""
 MAX_SCALE_SPREAD = 0.5

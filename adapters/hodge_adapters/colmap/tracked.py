@@ -48,9 +48,8 @@ from hodge_pipeline.types import (
     PositionPriors,
     ViewGraph,
 )
-from hodge_pipeline.types.pose_information import PoseInformation
 from hodge_pipeline.types.text import counted
-from hodge_pipeline.types.tracked_model import Adjusted
+from hodge_pipeline.types.tracked_model import Adjusted, PoseInformation
 
 LEAST_LEFT = 3
 """Entries of a track: two would meet in a point wherever the images are."""

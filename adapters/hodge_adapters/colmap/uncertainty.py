@@ -14,13 +14,14 @@ from hodge_adapters.colmap.points import error_cap, reprojection_errors
 from hodge_adapters.colmap.records import Model
 from hodge_pipeline import se3
 from hodge_pipeline.types import Bools, Floats, Ints
-from hodge_pipeline.types.pose_information import GAUGE, PoseInformation
+from hodge_pipeline.types.tracked_model import GAUGE, PoseInformation
 
 MOST_BODIES_JOINTLY = 300
 """Above it the joint covariance (6 B)² costs too much: each body is then taken given all others, which is too sure."""
 MOST_POINTS_AT_ONCE = 16384
 """Whose part of the joint normal matrix is in memory at once."""
 STEP = 1e-6
+"""Of the depth: central differences then err by 1e-10, by rounding."""
 LEAST_DISTANCE = 1e-4
 """Share of the median distance of points from cameras. A nearer one, as a robust loss leaves on a camera's centre,
 weighs 1e8 times as much: what is left of it once it is eliminated is rounding."""

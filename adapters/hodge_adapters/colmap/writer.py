@@ -60,11 +60,8 @@ class ColmapWriter:
                 f"{source.path}: COLMAP's text cannot hold names with blanks ({listed(blank)}): write form=bin"
             )
         _write_folder(Path(path), _files_of(model, self.form))
-        return written(f"{_sizes(model)}, {points}", source, {"cameras", "names", "images"})
-
-
-def _sizes(model: pycolmap.Reconstruction) -> str:
-    return f"{counted(model.num_reg_images(), 'image')}, {counted(model.num_cameras(), 'camera')}"
+        sizes = f"{counted(model.num_reg_images(), 'image')}, {counted(model.num_cameras(), 'camera')}"
+        return written(f"{sizes}, {points}", source, {"cameras", "names", "images"})
 
 
 def _whole_model(source: Source, frames: list[Frame]) -> pycolmap.Reconstruction | None:

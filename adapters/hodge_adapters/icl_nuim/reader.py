@@ -45,6 +45,7 @@ REPLICA = Intrinsics(600.0, 600.0, 599.5, 339.5, (1200, 680), 6553.5)
 ICL_UNITS_PER_METRE, REDWOOD_UNITS_PER_METRE = 5000.0, 1000.0
 TRUTH_PATTERN = "*.gt.freiburg*"
 MAX_GAP_FRAMES = 1.0
+"""The truth has a pose for every frame."""
 VIDEO_HZ = 30.0
 """Frames are rendered at this rate along a walked path."""
 SNIFFED_BYTES = 1 << 16

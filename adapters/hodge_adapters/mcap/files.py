@@ -71,7 +71,8 @@ def find_files(path: Path, notes: list[str]) -> Listing:
     found = [file for file in listed_files if file.is_file() and file.suffix in SUFFIXES]
     extra = [file for file in there if file not in found]
     if extra and found:
-        notes.append(f"{counted(len(extra), 'file')} that {METADATA} does not list read as well: {_names(extra)}")
+        names = listed([file.name for file in extra])
+        notes.append(f"{counted(len(extra), 'file')} that {METADATA} does not list read as well: {names}")
     found += extra
     if not found:
         raise SourceError(f"{path}: {METADATA} lists no .mcap or .db3 file that is there: {_remedy(path)}")
@@ -105,10 +106,6 @@ def _other_recording(path: Path, begins: bytes) -> str:
         return "a ROS 1 bag of another format than 2.0: `rosbag migrate` or `rosbag reindex` makes one of it"
     packed = ".mcap." in path.name or path.name.endswith((".tar", ".tar.gz", ".tar.xz", ".tar.zst", ".zip", ".7z"))
     return "packed: unpack it first" if packed else ""
-
-
-def _names(files: list[Path]) -> str:
-    return listed([file.name for file in files])
 
 
 def _remedy(path: Path) -> str:

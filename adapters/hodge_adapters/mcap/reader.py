@@ -118,7 +118,10 @@ class McapReader:
         return Source(
             name=path.stem if path.is_file() else path.resolve().name,
             path=path,
-            frames=tuple(_with_pose(frame, pose) for frame, pose in zip(frames, poses.of_frames, strict=True)),
+            frames=tuple(
+                replace(frame, world_from_cam=pose) if np.isfinite(pose).all() else frame
+                for frame, pose in zip(frames, poses.of_frames, strict=True)
+            ),
             trajectory=poses.trajectory,
             notes=tuple(notes),
             doubts=tuple(doubts),
@@ -263,10 +266,6 @@ def _coordinate_frame(topic: str, seen: Sequence[Seen[Layout]], notes: list[str]
             f"{topic}: {counted(len(seen) - count, 'message is|messages are')} not in {frame}: taken as if it were"
         )
     return frame
-
-
-def _with_pose(frame: Frame, world_from_cam: Floats) -> Frame:
-    return replace(frame, world_from_cam=world_from_cam) if np.isfinite(world_from_cam).all() else frame
 
 
 def _topics(recording: Recording) -> str:

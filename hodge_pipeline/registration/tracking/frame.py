@@ -1,7 +1,11 @@
-"""A frame while its block is tracked: its image, corners and cloud, each made when it is first needed."""
+"""A frame while its block is tracked: its image, corners and cloud, each made when it is first needed; and frames that
+repeat the one before.
+"""
 
 from __future__ import annotations
 
+import filecmp
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, cached_property
 from typing import Any
@@ -12,7 +16,7 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.registration.clouds import CloudOptions, cloud_or_note, is_blank
 from hodge_pipeline.registration.tracking.flow import Corners, FlowImage, find_corners, flow_image
 from hodge_pipeline.stages import Registrar
-from hodge_pipeline.types import Bytes, Floats, Frame, PointCloud
+from hodge_pipeline.types import Bytes, Floats, Frame, Ints, PointCloud
 
 FEWEST_FOLLOWED = 25
 """Corners that must agree on a motion for it to be believed; below it clouds are registered."""
@@ -86,3 +90,24 @@ class TrackedFrame:
         for made in ("image", "cloud_and_note", "prepared"):
             self.__dict__.pop(made, None)
         self.corners = corners
+
+
+def find_repeats(frames: Sequence[Frame]) -> Ints:
+    """The rows of frames whose colour file and depth image are those of the frame before, in the same sequence: where
+    a camera stalls they tell of no motion.
+    """
+    pairs = zip(frames[:-1], frames[1:], strict=True)
+    return np.array([row for row, pair in enumerate(pairs, start=1) if _are_same(*pair)], np.int64)
+
+
+def _are_same(one: Frame, other: Frame) -> bool:
+    if one.sequence != other.sequence or not (one.image and other.image and one.read_depth and other.read_depth):
+        return False
+    try:  # files of two sizes, as nearly all are, are not read
+        if not filecmp.cmp(one.image.path, other.image.path, shallow=False):
+            return False
+        depth = other.read_depth()
+        in_the_dark = not depth.any()  # where all frames are alike
+        return not in_the_dark and np.array_equal(one.read_depth(), depth, equal_nan=True)
+    except (SourceError, OSError):
+        return False

@@ -16,6 +16,7 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import Diagnosis
 from hodge_pipeline.registration.assessment import MOST_VIOLATION
+from hodge_pipeline.registration.odometry import REACHES_APART
 from hodge_pipeline.start.unordered.hypotheses import ViewOf, violations
 from hodge_pipeline.types import Bools, CloudSet, Floats, Ints, ViewGraph
 from hodge_pipeline.types.arrays import evenly
@@ -133,3 +134,21 @@ def within_parts(edges: Ints, strength: Floats, forbidden: Ints, count: int) -> 
             enemies[other].discard(b)
             enemies[other].add(a)
     return np.asarray(part[edges[:, 0]] == part[edges[:, 1]])
+
+
+def laid_apart(piece: Ints, piece_from: Floats, clouds: CloudSet) -> Floats:
+    """Poses (N, 4, 4) in one world: the first piece begins with the identity at its first frame, each other one
+    without a turn, beside the one before it.
+
+    `piece (N,)`, `piece_from (N, 4, 4)`: the piece of each frame and its pose in it. Pieces lie so far apart that
+    no cloud reaches another's.
+    """
+    space = REACHES_APART * clouds.reach_m
+    out = np.array(piece_from, float)
+    begin_x = -np.inf
+    for number in range(int(piece.max(initial=-1)) + 1):
+        rows = np.flatnonzero(piece == number)
+        out[rows] = se3.inverse(piece_from[rows[0]]) @ piece_from[rows]
+        out[rows, 0, 3] += max(0.0, begin_x - float(out[rows, 0, 3].min()))
+        begin_x = float(out[rows, 0, 3].max()) + space
+    return out

@@ -6,14 +6,13 @@ import shutil
 from dataclasses import replace
 
 import numpy as np
-from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.registration.clouds import CloudOptions
 from hodge_pipeline.registration.gaps import gaps
 from hodge_pipeline.scene import START, Drift, KeyFrames, Round, Scene, sequences_of, vertex_ids
-from hodge_pipeline.stages import Step, Steps, Workers
+from hodge_pipeline.stages import OPTIONS, Step, Steps, Workers
 from hodge_pipeline.start.clouds import landmarks_for, make_clouds
 from hodge_pipeline.start.unordered.options import GlobalStart
 from hodge_pipeline.start.unordered.start import Frames, Start, find_start
@@ -21,7 +20,7 @@ from hodge_pipeline.types import CloudSet, Edges, Source
 from hodge_pipeline.types.notes import Note
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
+@dataclass(frozen=True, config=OPTIONS)
 class UnorderedStart(GlobalStart):
     """Matches frames or scans without a guess; nothing is taken from the order of the files or their stamps."""
 

@@ -12,7 +12,7 @@ from hodge_pipeline.pairs.drift import DriftEdges
 from hodge_pipeline.registration.gicp import Gicp
 from hodge_pipeline.registration.global_landmarks import LandmarkConsensus
 from hodge_pipeline.registration.global_registrars import FpfhConsensus
-from hodge_pipeline.stages import EdgeBuilder, GlobalRegistrar, Registrar
+from hodge_pipeline.stages import OPTIONS, EdgeBuilder, GlobalRegistrar, Registrar
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -29,7 +29,7 @@ class HypothesisLimits:
     )
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid", arbitrary_types_allowed=True))
+@dataclass(frozen=True, config=OPTIONS)
 class GlobalStart:
     """How frames or scans in no order are joined."""
 

@@ -1,6 +1,9 @@
-"""Checks of scans before registration: duplicates, surfaces that leave a motion undetermined."""
+"""Checks of scans: duplicates, surfaces that leave a motion undetermined, reflections of what the scanner saw."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,12 +11,21 @@ from scipy.spatial import cKDTree
 
 from hodge_pipeline.registration.global_evidence import free_directions
 from hodge_pipeline.registration.global_features import FEWEST_POINTS
-from hodge_pipeline.types import CloudSet, Floats, PointCloud
+from hodge_pipeline.start.unordered.hypotheses import RIVAL_OVERLAP
+from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, PointCloud
 
 SURFACE_NEIGHBOURS = 30
 SAMPLED_POINTS = 2000
 VOLUME = 0.12
 """Least share of variance in a neighbourhood of no surface: a third in a volume, a few per cent on a surface."""
+POORER = 0.5
+"""Share of the usual best overlap of a scan below which its reflection is matched: half, since a right scan is often as
+poor, and matching costs seconds, but decides nothing by itself."""
+PARTNERS = 3
+"""Scans that a reflection is matched with: those that the scan itself overlaps most."""
+
+Match = Callable[[CloudSet, Path], Edges]
+"""All pairs of a few clouds, matched and weighed; the folder is for scratch."""
 
 
 def check_scans(clouds: CloudSet, names: NDArray[np.generic]) -> tuple[str, ...]:
@@ -58,3 +70,32 @@ def _copies(clouds: CloudSet, names: NDArray[np.generic]) -> list[str]:
             if before != row:
                 notes.append(f"scan {names[row]}: holds the same points as scan {names[before]}")
     return notes
+
+
+def mirrored_scans(clouds: CloudSet, hypotheses: Edges, match: Match, scratch: Path) -> Ints:
+    """Rows of joined scans whose reflection fits the scans that they are joined to clearly better than they do."""
+    edges = hypotheses.select(np.flatnonzero(hypotheses.counts))
+    best = np.zeros(len(clouds))
+    np.maximum.at(best, edges.pairs, edges.overlap[:, None])
+    poor = np.flatnonzero((best > 0) & (best < POORER * np.median(best[best > 0]))) if len(edges) else np.zeros(0, int)
+    return np.array([row for row in poor.tolist() if _is_mirrored(row, clouds, edges, match, scratch)], np.int64)
+
+
+def _is_mirrored(row: int, clouds: CloudSet, edges: Edges, match: Match, scratch: Path) -> bool:
+    own = edges.select(np.flatnonzero((edges.pairs == row).any(axis=1)))
+    own = own.select(np.argsort(-own.overlap, kind="stable")[:PARTNERS])
+    partners = own.pairs.sum(axis=1) - row
+    folder = scratch / f"mirrored-{row}"
+    folder.mkdir(parents=True)
+    CloudSet.from_clouds([reflected(clouds[row]), *(clouds[int(partner)] for partner in partners)]).save(folder)
+    found = match(CloudSet.open(folder), folder)
+    overlap = np.zeros(len(partners) + 1)
+    first = np.flatnonzero(found.counts & (found.pairs[:, 0] == 0))
+    overlap[found.pairs[first, 1]] = found.overlap[first]
+    return bool((RIVAL_OVERLAP * overlap[1:] > own.overlap).all())
+
+
+def reflected(cloud: PointCloud) -> PointCloud:
+    """The points reflected in x: any other reflection differs from it by a turn."""
+    across, normals = np.array([-1, 1, 1], np.float32), cloud.normals_in_cam
+    return PointCloud(across * cloud.points_in_cam, None if normals is None else across * normals)

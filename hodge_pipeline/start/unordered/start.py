@@ -21,12 +21,10 @@ from hodge_pipeline.registration.odometry_path import contradicts_odometry
 from hodge_pipeline.scene import Drift
 from hodge_pipeline.solvers.backbone.trust import SEQUENTIAL
 from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers, no_progress
-from hodge_pipeline.start.unordered.folds import Pieces, unfolded
+from hodge_pipeline.start.unordered.folds import Pieces, laid_apart, unfolded
 from hodge_pipeline.start.unordered.hypotheses import AMBIGUOUS, weigh
-from hodge_pipeline.start.unordered.mirrored import mirrored_scans
 from hodge_pipeline.start.unordered.options import GlobalStart
-from hodge_pipeline.start.unordered.pieces import laid_apart
-from hodge_pipeline.start.unordered.scan_checks import check_scans
+from hodge_pipeline.start.unordered.scan_checks import check_scans, mirrored_scans
 from hodge_pipeline.start.unordered.views import Views
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Ints, ViewGraph
 from hodge_pipeline.types.edges import REJECTED
