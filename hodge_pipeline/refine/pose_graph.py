@@ -95,8 +95,10 @@ class SolvedFile:
 
     @property
     def excess(self) -> float:
-        """By how many times what they state edges are off, √(χ² / degrees of freedom); 0 where nothing tells: of a robust
-        solve, which judges this itself, of another objective than χ², and without redundant edges or information.
+        """By how many times what they state edges are off, √(χ² / degrees of freedom); 0 where nothing tells.
+
+        So it is of a robust solve, which judges this itself, of another objective than χ², and without redundant edges
+        or information.
         """
         graph, solution = self.graph.select(self.solution.weights > 0), self.solution
         if self.choices.robust or "chi2" not in solution.metrics or has_unit_information(graph):
