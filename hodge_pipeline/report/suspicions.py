@@ -62,7 +62,8 @@ def other_scale(report: Report) -> Iterator[Note]:
         return
     x, y = x[rows] - x[rows].mean(axis=0), y[rows] - y[rows].mean(axis=0)
     scale = float(np.sum(x * y) / max(np.sum(x * x), np.finfo(float).tiny))
-    explained = np.sum((scale * x - y) ** 2) < EXPLAINED**2 * np.sum((x - y) ** 2)
+    left = np.sum((scale * x - y) ** 2)
+    explained = left < EXPLAINED**2 * min(np.sum((x - y) ** 2), np.sum(y**2))  # of a camera that stayed, nothing is
     if explained and (scale > OTHER_SCALE or 0 < scale < 1 / OTHER_SCALE):
         yield Note("other scale", detail=f"{float(f'{scale:.2g}'):g}")
 

@@ -119,6 +119,6 @@ def _decompose(csc: csc_matrix, ordering: str) -> SuperLU:
 
 def _singular(size: int) -> str:
     return (
-        f"the edges do not determine all {size} unknowns (a singular linear system): some have information that is zero "
-        "or almost zero on an axis: state some on each, or leave these edges out"
+        f"the edges do not determine all {size} unknowns (a singular linear system): some have information that is "
+        "zero or almost zero on an axis: state some on each, or leave these edges out"
     )
