@@ -76,21 +76,22 @@ def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
     nothing = _nothing(last)
     if nothing or last.solution is None:
         return Decision("nothing", nothing), before
+    jumps, off_images = sure_jumps(work, key_frames, last.world_from_cam)
+    mended = without_steps(before, last.world_from_cam, jumps) if len(jumps) else before
     smoothed = without_noise(
-        last.graph, last.solution, before, first_of_steps(key_frames), work.recipe.guard.shared_errors
+        last.graph, last.solution, mended, first_of_steps(key_frames), work.recipe.guard.shared_errors
     )
-    solved = last.world_from_cam if smoothed is None or smoothed is before else smoothed
+    solved = last.world_from_cam if smoothed is None or smoothed is mended else smoothed
     chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, solved)]
-    jumps, off_images = sure_jumps(work, key_frames, solved)
     after, measures = _held_out(work, held_out_pairs(rounds), key_frames, spread_corrections(key_frames, solved, jumps))
     measures.append(chi2_measure(*chi2))
     moved = pose_change(last.graph, replace(last.solution, world_from_cam=after), before)
     decision = decide(measures, moved, force=work.recipe.guard.force)
     if convention:
         return Decision("forced", convention, decision.measures, moved), after
-    if len(jumps) and (decision.outcome == "optimal" or (decision.outcome == "refined" and smoothed is before)):
-        return _without_jumps(work, rounds, key_frames, solved, jumps, off_images)
-    if decision.outcome == "refined" and smoothed is before:
+    if len(jumps) and (decision.outcome == "optimal" or (decision.outcome == "refined" and smoothed is mended)):
+        return _without_jumps(work, rounds, key_frames, mended, jumps, off_images)
+    if decision.outcome == "refined" and smoothed is mended:
         return Decision("optimal", KEPT, decision.measures, moved), after
     if decision.outcome == "refined":  # so far by clouds alone, which a sensor may warp alike in every frame
         measures += [
@@ -103,12 +104,12 @@ def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
 
 
 def _without_jumps(
-    work: Work, rounds: Sequence[Round], key_frames: KeyFrames, solved: Floats, jumps: Ints, off_images: list[Measure]
+    work: Work, rounds: Sequence[Round], key_frames: KeyFrames, after: Floats, jumps: Ints, off_images: list[Measure]
 ) -> tuple[Decision, Floats]:
-    """The decision on the given poses less their jumps, where nothing else of them is to be bettered."""
+    """The decision on the given poses less their jumps (K, 4, 4), where nothing else of them is to be bettered."""
     last, before = rounds[-1], key_frames.world_from_key
     assert last.solution is not None
-    after, held_out = _held_out(work, held_out_pairs(rounds), key_frames, without_steps(before, solved, jumps)[None])
+    after, held_out = _held_out(work, held_out_pairs(rounds), key_frames, after[None])
     chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, after)]
     moved = pose_change(last.graph, replace(last.solution, world_from_cam=after), before)
     decision = decide([*off_images, *held_out, chi2_measure(*chi2)], moved, force=work.recipe.guard.force)
