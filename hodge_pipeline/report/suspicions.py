@@ -21,6 +21,8 @@ OTHER_SCALE, EXPLAINED = 1.1, 0.25
 """The factor between the true path and the result from which one is not in metres, if scaling by it leaves less than a
 quarter of the error: focal lengths are known to a few per cent, and units differ by 5 or 1000.
 """
+MOST_NAMED = 5
+"""Frames without an edge that a note names: they fit on its line."""
 NOTHING_MOVED_M = 0.0005
 """The least movement that is reported, in a room."""
 
@@ -71,9 +73,10 @@ def other_scale(report: Report) -> Iterator[Note]:
 def _graph_suspicions(graph: GraphSummary) -> Iterator[Note]:
     if len(graph.components) > 1:
         yield Note("parts", len(graph.components))
-    alone = sum(part.count == 1 for part in graph.components)
+    alone = [part.frames for part in graph.components if part.count == 1]
     if alone and graph.vertices > 1:
-        yield Note("alone", alone, str(graph.vertices))
+        named = ", ".join(alone[:MOST_NAMED]) + ", …" * (len(alone) > MOST_NAMED)
+        yield Note("alone", len(alone), f"{graph.vertices} frames ({named})")
     if graph.edges_ignored:
         yield Note("edges ignored", graph.edges_ignored, str(graph.edges))
     if suspect := graph.verdicts_in_use.get("suspect", 0):
