@@ -266,7 +266,7 @@ def test_what_to_distrust_is_said(report: Report) -> None:
     for expected in (
         "2 pairs were tried twice",
         "falls into 3 parts",
-        "1 of 20 frames (19) has no edge",
+        "1 of 20 frames (119) has no edge",
         "ignored 2 of 20 edges",
         "At least 1 edge ",
         "odometry: 2 of 3 near-centroid pairs have no point within 10 cm",
