@@ -43,8 +43,8 @@ SESYNC_UNITS = np.array([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 """SE-Sync reads g2o's information of the quaternion's vector part, half an angle, as that of the angle."""
 UNTOLD = "the odometry states no errors of some axes: --robust learns them from the loops, which may be far better"
 MOST_EXCESS = 3.0
-"""Edges may be off by so many times what they state: by at most 1.0 times in twenty graphs of the literature and of SLAM
-without wrong edges or with few, by 8 and 11 times in Bicocca's with most of its wrong loops.
+"""Edges may be off by so many times what they state: by at most 1.0 times in twenty graphs of the literature and of
+SLAM without wrong edges or with few, by 8 and 11 times in Bicocca's with most of its wrong loops.
 """
 MOST_POSES_FILMED = 20_000
 """Above it the recording shows the start and the end of the solve only."""
