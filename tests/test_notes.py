@@ -27,8 +27,9 @@ def test_doubt_comes_before_what_only_informs() -> None:
 
 
 def test_a_note_of_one_speaks_of_one() -> None:
-    assert str(Note("alone", 1, "20")).startswith("1 of 20 frames has no edge at all: it keeps the pose it started")
-    assert str(Note("alone", 3, "20")).startswith("3 of 20 frames have no edge at all: they keep the pose they started")
+    one, three = (str(Note("alone", count, f"20 frames ({names})")) for count, names in ((1, "7"), (3, "7, 8, 9")))
+    assert one.startswith("1 of 20 frames (7) has no edge at all: its pose is not measured, in the files of poses too")
+    assert three.startswith("3 of 20 frames (7, 8, 9) have no edge at all: their poses are not measured, in the files")
     assert "1 frame without a given pose is carried" in str(Note("carried", 1))
     assert counted(1, "edge") == "1 edge" and counted(0, "edge") == "0 edges"
     assert counted(2, "vertex is|vertices are") == "2 vertices are"

@@ -11,6 +11,7 @@ from hodge_pipeline.cli.main import app
 from hodge_pipeline.refine import given_poses
 from hodge_pipeline.refine.given_poses import chi2_measure, first_as_good, spread_corrections
 from hodge_pipeline.refine.guard import Measure, PoseChange, decide, mean_noise
+from hodge_pipeline.refine.jumps import sure_jumps, without_steps
 from hodge_pipeline.refine.path_size import path_size
 from hodge_pipeline.scene import KeyFrames
 from hodge_pipeline.types.notes import Note
@@ -97,7 +98,7 @@ def key_frames(count: int) -> tuple[KeyFrames, np.ndarray]:
 
 def test_a_wider_correction_keeps_more_of_the_given_steps():
     frames, after = key_frames(33)
-    found = spread_corrections(frames, after)
+    found = spread_corrections(frames, after, np.zeros(0, np.int64))
     np.testing.assert_array_equal(found[-1], after)
     sideways = np.abs(np.diff(found[:, :, 1, 3], axis=1)).max(axis=1)
     assert sideways[-1] == pytest.approx(0.02) and (sideways[:-1] < 1e-9).all(), "even knots moved alike"
@@ -136,8 +137,12 @@ def test_a_change_is_told_in_millimetres_and_degrees():
     assert told == "poses moved by 12.5 mm and 0.25° (RMS), known to 4 mm and 0.5°"
 
 
-def sized(before: np.ndarray, after: np.ndarray, off_images_m: np.ndarray, monkeypatch: pytest.MonkeyPatch):
-    """The measures of a path's size, and the notes, where images lie off the steps by this (2,)."""
+def work_of(
+    before: np.ndarray, off_images_m: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> tuple[SimpleNamespace, KeyFrames, list[Note]]:
+    """The work, key frames of these poses and its notes, where images lie off each step, before and after, by this (2,)
+    or (2, K - 1).
+    """
     notes: list[Note] = []
     steps = SimpleNamespace(note=lambda *more: notes.extend(more))
     frames = [SimpleNamespace(frame_id=row) for row in range(len(before))]
@@ -146,8 +151,14 @@ def sized(before: np.ndarray, after: np.ndarray, off_images_m: np.ndarray, monke
     )
     rows, zeros, ones = np.arange(len(before)), np.zeros(len(before), np.int64), np.ones(len(before), bool)
     keys = KeyFrames(rows, before, before, zeros, rows / 30, ones, rows / 30, zeros, rows)
-    off_m = "hodge_pipeline.refine.path_size.off_images_m"
-    monkeypatch.setattr(off_m, lambda work, firsts, *poses: np.tile(off_images_m[:, None], len(firsts)))
+    off_m = np.broadcast_to(off_images_m.reshape(2, -1), (2, len(before) - 1))
+    monkeypatch.setattr("hodge_pipeline.refine.jumps.off_images_m", lambda work, firsts, *poses: off_m[:, firsts])
+    return work, keys, notes
+
+
+def sized(before: np.ndarray, after: np.ndarray, off_images_m: np.ndarray, monkeypatch: pytest.MonkeyPatch):
+    """The measures of a path's size, and the notes, where images lie off the steps by this (2,)."""
+    work, keys, notes = work_of(before, off_images_m, monkeypatch)
     return path_size(work, keys, after), notes
 
 
@@ -169,3 +180,32 @@ def test_a_jump_of_the_given_path_is_no_other_scale(monkeypatch: pytest.MonkeyPa
         assert measures and notes[0].kind == "path scaled", "a jump of the refined path, or one that images show"
     measures, notes = sized(se3.rescaled(true, 1.3), true, nothing, monkeypatch)
     assert measures and notes[0].kind == "path scaled" and notes[0].detail == "0.769"
+
+
+def test_a_pose_that_images_put_elsewhere_is_a_sure_jump_there_and_back(monkeypatch: pytest.MonkeyPatch):
+    """Pose 5 of twelve lies 30 cm beside the path; images err by 3 mm. Steps back in place, the rest is as it was."""
+    true = se3.from_parts(np.broadcast_to(np.eye(3), (12, 3, 3)), np.outer(np.arange(12), [0.05, 0, 0]))
+    given = true.copy()
+    given[5, 1, 3] += 0.3
+    off_m = np.full((2, 11), 0.003)
+    off_m[0, [4, 5]] = 0.3
+    work, keys, _ = work_of(given, off_m, monkeypatch)
+    rows, (measure,) = sure_jumps(work, keys, true)
+    assert sorted(rows.tolist()) == [4, 5] and measure.is_better and str(measure).endswith("300 → 3 mm")
+    np.testing.assert_allclose(without_steps(given, true, rows), true, atol=1e-12)
+    for before, after in ((0.02, 0.003), (0.3, 0.2), (np.nan, np.nan)):  # as true steps err, both off, no images
+        off_m[:, [4, 5]] = np.array([[before], [after]])
+        work, keys, _ = work_of(given, off_m, monkeypatch)
+        rows, measures = sure_jumps(work, keys, true)
+        assert not len(rows) and not measures
+
+
+def test_the_widest_correction_still_takes_jumps_out():
+    """Pose 5 alone is off, between knots 16 apart."""
+    true = se3.from_parts(np.broadcast_to(np.eye(3), (40, 3, 3)), np.outer(np.arange(40), [0.05, 0, 0]))
+    given = true.copy()
+    given[5, 1, 3] += 0.3
+    rows, zeros, ones = np.arange(40), np.zeros(40, np.int64), np.ones(40, bool)
+    keys = KeyFrames(rows, given, given, zeros, rows / 30, ones, rows / 30, zeros, rows)
+    widest = spread_corrections(keys, true, np.array([4, 5]))[0]
+    np.testing.assert_allclose(widest, true, atol=1e-9)

@@ -147,6 +147,17 @@ def test_the_result_is_the_poses_written_not_the_last_rounds(monkeypatch: pytest
     assert run_report._shown([], scene, written, is_refined=False) is sets
 
 
+def test_a_single_pose_that_is_far_off_is_not_called_optimal(sequence: Path, truth: Trajectory, tmp_path: Path) -> None:
+    """Held-out pairs hardly touch it, since there it overlaps with nothing: images tell."""
+    given = truth.world_from_cam.copy()
+    given[8] = given[8] @ se3.exp(np.array([0.0, 0.1, 0.0, 0.3, 0.0, 0.1]))
+    write_tum(tmp_path / "slam.txt", Trajectory(truth.stamps_s, given))
+    assert refine(tmp_path / "slam.txt", sequence, tmp_path / "run", "--set", "start.every=1").exit_code == 0
+    assert outcome(tmp_path / "run") == "refined"
+    found = parse_tum(tmp_path / "run" / "refined.txt").trajectory
+    assert error_m(found.world_from_cam, truth) < 0.04
+
+
 def test_optimal_poses_come_back_byte_for_byte(refined: Path, sequence: Path, tmp_path: Path) -> None:
     text = "# my own comment\n" + (refined / "refined.txt").read_text()
     (tmp_path / "slam.txt").write_text(text)

@@ -270,3 +270,27 @@ def test_an_odometry_that_states_nothing_of_some_axes_is_told(tmp_path: Path) ->
     assert UNTOLD not in solve_file(tmp_path / "robot.g2o", SolveOptions(robust=True)).solution.notes
     (tmp_path / "robot.g2o").write_text("\n".join(lines).replace("0.001", "1000"))
     assert UNTOLD not in solve_file(tmp_path / "robot.g2o", SolveOptions()).solution.notes
+
+
+@pytest.mark.parametrize(("stated", "excess"), [(1.0, ""), (0.1, "edges are off by 9.5 times what they state")])
+def test_the_headline_tells_edges_that_contradict_each_other(tmp_path, stated, excess):
+    """A planar walk of three rounds with loops, each edge off by one standard deviation, or by ten of those stated."""
+    rng = np.random.default_rng(1)
+    truth = se3.exp(np.cumsum(np.tile([0, 0, np.pi / 6, 0, 0, 0], (36, 1)), axis=0))
+    truth[:, :2, 3] = 3 * truth[:, :2, 0]
+    edges = np.array([(k, k + 1) for k in range(35)] + [(k, k + 12) for k in range(24)])
+    sigma = np.array([0, 0, 0.01, 0.05, 0.05, 0])
+    measured = se3.inverse(truth[edges[:, 0]]) @ truth[edges[:, 1]] @ se3.exp(sigma * rng.normal(size=(59, 6)))
+    information = np.diag([0, 0, 1e4, 400, 400, 0]) / stated**2
+    graph = ViewGraph.from_edges(np.arange(36), edges, measured, np.tile(information, (59, 1, 1)), dimension=2)
+    write_g2o(tmp_path / "in.g2o", graph, truth)
+    solved = solve_file(tmp_path / "in.g2o", SolveOptions())
+    assert solved.headline.startswith(f"Solved, but {excess}: chi2" if excess else "Solved: chi2"), solved.headline
+    assert solve_file(tmp_path / "in.g2o", SolveOptions(objective="isotropic")).headline.startswith("Solved: F")
+
+
+def test_edges_without_information_on_an_axis_are_named_as_the_cause(tmp_path):
+    lines = [f"EDGE_SE2 {k} {k + 1} 1 0 0.5 25 0 0 25 0 0" for k in range(6)] + ["EDGE_SE2 0 6 0 1 0.3 25 0 0 25 0 0"]
+    (tmp_path / "in.g2o").write_text("\n".join(lines) + "\n")
+    with pytest.raises(GraphError, match="information that is zero or almost zero on an axis"):
+        solve_file(tmp_path / "in.g2o", SolveOptions())

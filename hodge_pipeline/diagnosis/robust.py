@@ -118,13 +118,18 @@ def is_explained(graph: ViewGraph, solution: Solution) -> bool:
     """
     if has_unit_information(graph):
         return False
+    freedom = degrees_of_freedom(graph, solution)
+    return freedom <= 0 or solution.metrics["objective"] <= freedom + SIGMAS * math.sqrt(2 * freedom)
+
+
+def degrees_of_freedom(graph: ViewGraph, solution: Solution) -> int:
+    """How many more numbers edges and priors state than the poses of their solution have."""
     axes = 3 if dimension_of(graph) == 2 else 6
     informed = np.zeros(0, np.int64) if graph.priors is None else graph.priors.vertices
     free = np.ones(int(solution.component.max(initial=-1)) + 1, np.int64)  # gauge: one pose of each component
     free[solution.component[informed]] = 0
     held = np.maximum(np.bincount(solution.component[graph.fixed], minlength=len(free)), free).sum()
-    freedom = axes * int(graph.edge_count + len(informed) - graph.vertex_count + held)
-    return freedom <= 0 or solution.metrics["objective"] <= freedom + SIGMAS * math.sqrt(2 * freedom)
+    return axes * int(graph.edge_count + len(informed) - graph.vertex_count + held)
 
 
 def _placed(graph: ViewGraph, poses: Floats, start: Floats | None) -> Floats:

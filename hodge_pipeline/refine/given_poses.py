@@ -19,6 +19,7 @@ from hodge_pipeline.refine.against_images import against_images, first_of_steps
 from hodge_pipeline.refine.conventions import explained
 from hodge_pipeline.refine.given_noise import without_noise
 from hodge_pipeline.refine.guard import SCORE_TOLERANCE, Decision, Measure, decide, mean_noise
+from hodge_pipeline.refine.jumps import jump_note, sure_jumps, without_steps
 from hodge_pipeline.refine.path_size import path_size
 from hodge_pipeline.refine.uncertainty import mean_chi2, pose_change
 from hodge_pipeline.rounds.one_round import Work
@@ -75,18 +76,22 @@ def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
     nothing = _nothing(last)
     if nothing or last.solution is None:
         return Decision("nothing", nothing), before
+    jumps, off_images = sure_jumps(work, key_frames, last.world_from_cam)
+    mended = without_steps(before, last.world_from_cam, jumps) if len(jumps) else before
     smoothed = without_noise(
-        last.graph, last.solution, before, first_of_steps(key_frames), work.recipe.guard.shared_errors
+        last.graph, last.solution, mended, first_of_steps(key_frames), work.recipe.guard.shared_errors
     )
-    solved = last.world_from_cam if smoothed is None or smoothed is before else smoothed
+    solved = last.world_from_cam if smoothed is None or smoothed is mended else smoothed
     chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, solved)]
-    after, measures = _held_out(work, held_out_pairs(rounds), key_frames, solved)
+    after, measures = _held_out(work, held_out_pairs(rounds), key_frames, spread_corrections(key_frames, solved, jumps))
     measures.append(chi2_measure(*chi2))
     moved = pose_change(last.graph, replace(last.solution, world_from_cam=after), before)
     decision = decide(measures, moved, force=work.recipe.guard.force)
     if convention:
         return Decision("forced", convention, decision.measures, moved), after
-    if decision.outcome == "refined" and smoothed is before:
+    if len(jumps) and (decision.outcome == "optimal" or (decision.outcome == "refined" and smoothed is mended)):
+        return _without_jumps(work, rounds, key_frames, mended, jumps, off_images)
+    if decision.outcome == "refined" and smoothed is mended:
         return Decision("optimal", KEPT, decision.measures, moved), after
     if decision.outcome == "refined":  # so far by clouds alone, which a sensor may warp alike in every frame
         measures += [
@@ -95,6 +100,21 @@ def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
             *_settled(work, rounds),
         ]
         decision = decide(measures, moved, force=work.recipe.guard.force)
+    return decision, after
+
+
+def _without_jumps(
+    work: Work, rounds: Sequence[Round], key_frames: KeyFrames, after: Floats, jumps: Ints, off_images: list[Measure]
+) -> tuple[Decision, Floats]:
+    """The decision on the given poses less their jumps (K, 4, 4), where nothing else of them is to be bettered."""
+    last, before = rounds[-1], key_frames.world_from_key
+    assert last.solution is not None
+    after, held_out = _held_out(work, held_out_pairs(rounds), key_frames, after[None])
+    chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, after)]
+    moved = pose_change(last.graph, replace(last.solution, world_from_cam=after), before)
+    decision = decide([*off_images, *held_out, chi2_measure(*chi2)], moved, force=work.recipe.guard.force)
+    if decision.outcome == "refined":
+        work.steps.note(jump_note(work, before, after, jumps))
     return decision, after
 
 
@@ -139,11 +159,14 @@ def _nothing(last: Round) -> str:
     return ""
 
 
-def spread_corrections(key_frames: KeyFrames, after: Floats) -> Floats:
-    """Key-frame poses (S, K, 4, 4), one set for each spacing of `KNOTS_APART`: knots as solved, given steps between."""
+def spread_corrections(key_frames: KeyFrames, after: Floats, jumps: Ints) -> Floats:
+    """Key-frame poses (S, K, 4, 4), one set for each spacing of `KNOTS_APART`: knots as solved, given steps between.
+
+    Both ends of the given path's jumps, from the rows `jumps` to the next, are knots of each set.
+    """
     out, count = [], len(after)
     for apart in KNOTS_APART:
-        knots = np.union1d(np.arange(0, count, apart), count - 1)
+        knots = np.unique(np.concatenate([np.arange(0, count, apart), [count - 1], jumps, jumps + 1]))
         some = replace(key_frames, rows=key_frames.rows[knots], world_from_key=key_frames.world_from_key[knots])
         out.append(after if apart == 1 else some.expand(after[knots])[key_frames.rows])
     return np.array(out)
@@ -154,15 +177,13 @@ def chi2_measure(before: float, after: float) -> Measure:
     return Measure("edge chi2, mean", before, after, tolerance=CHI2_TOLERANCE * before)
 
 
-def _held_out(work: Work, pairs: Ints, key_frames: KeyFrames, after: Floats) -> tuple[Floats, list[Measure]]:
-    """The widest spaced correction (K, 4, 4) that fits the pairs held out of every round, and their score as a measure.
-
-    Without such pairs the poses after, and no measure.
+def _held_out(work: Work, pairs: Ints, key_frames: KeyFrames, found: Floats) -> tuple[Floats, list[Measure]]:
+    """The first of the sets of poses (S, K, 4, 4) that fits the pairs held out of every round as well as the best, and
+    their score as a measure. Without such pairs the last set, and no measure.
     """
     if not len(pairs):
         work.steps.note(Note("nothing held out", 0))
-        return after, []
-    found = spread_corrections(key_frames, after)
+        return found[-1], []
     scale = float(work.recipe.scale)
     poses = np.stack([key_frames.world_from_key, *found])
     distances = work.steps.step(
@@ -174,7 +195,8 @@ def _held_out(work: Work, pairs: Ints, key_frames: KeyFrames, after: Floats) -> 
     tolerance = max(mean_noise(scores[1] - scores[0]), SCORE_TOLERANCE)
     mean_mm, mean = distances.mean(axis=1) * 1000, scores.mean(axis=1)
     apart = f"{mean_mm[0]:.3g} mm apart before, {mean_mm[1]:.3g} mm after"
-    work.steps.note(Note("held out", len(pairs), f"{apart}, the correction at every {KNOTS_APART[row - 1]}. key frame"))
+    knots = f", the correction at every {KNOTS_APART[row - 1]}. key frame" if len(found) > 1 else ""
+    work.steps.note(Note("held out", len(pairs), apart + knots))
     name = "score of held-out edges"
     return found[row - 1], [Measure(name, float(mean[0]), float(mean[1]), "higher", tolerance, is_held_out=True)]
 

@@ -1,17 +1,16 @@
-"""Whether refinement changed the size of the path, and jumps of the given path that look like it."""
+"""Whether refinement changed the size of the path, jumps of the given one aside."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from hodge_pipeline import se3
-from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.evaluation.trajectory import absolute_error
-from hodge_pipeline.refine.against_images import STEP_TOLERANCE_MM, first_of_steps, off_images_m
+from hodge_pipeline.refine.against_images import STEP_TOLERANCE_MM
 from hodge_pipeline.refine.guard import Measure
+from hodge_pipeline.refine.jumps import jump_note, jumps_of, without_steps
 from hodge_pipeline.rounds.one_round import Work
-from hodge_pipeline.scene import KeyFrames, vertex_ids
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.scene import KeyFrames
+from hodge_pipeline.types import Floats
 from hodge_pipeline.types.notes import Note
 
 TOLD_SIZE, LARGEST_SIZE = 0.005, 0.1
@@ -19,10 +18,6 @@ TOLD_SIZE, LARGEST_SIZE = 0.005, 0.1
 known to a few per cent."""
 SIZE_LEAVES = 0.5
 """Share of the movement left after scaling, up to which scale explains it: drift bends a path instead."""
-UNLIKE, MOST_JUMPS = 0.5, 3
-"""A step that differs from the refined one by more than half of the longer of the two is no scaled copy of it; jumps
-that a note names.
-"""
 
 
 def path_size(work: Work, key_frames: KeyFrames, after: Floats) -> list[Measure]:
@@ -31,64 +26,14 @@ def path_size(work: Work, key_frames: KeyFrames, after: Floats) -> list[Measure]
     """
     before = key_frames.world_from_key
     measures, told = _size_change(work, before, after)
-    jumps, few = _jumps(work, key_frames, after) if measures else (key_frames.rows[:0], 1)
+    jumps, few = jumps_of(work, key_frames, after) if measures else (key_frames.rows[:0], 1)
     for count in range(few, len(jumps) + 1):
-        mended = _size_change(work, _without_steps(before, after, jumps[:count]), after)
+        mended = _size_change(work, without_steps(before, after, jumps[:count]), after)
         if not any(measure.is_worse for measure in mended[0]):
-            measures, told = mended[0], [_jump_note(work, before, after, jumps[:count]), *mended[1]]
+            measures, told = mended[0], [jump_note(work, before, after, jumps[:count]), *mended[1]]
             break
     work.steps.note(*told)
     return measures
-
-
-def _jump_note(work: Work, before: Floats, after: Floats, jumps: Ints) -> Note:
-    names = vertex_ids(work.scene.source)
-    lengths_m = [np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) for poses in (before, after)]
-    steps = [
-        f"from frame {names[k]} to {names[k + 1]} by {', not '.join(length(m[k]) for m in lengths_m)}" for k in jumps
-    ]
-    more = f"; and {len(steps) - MOST_JUMPS} more" if len(steps) > MOST_JUMPS else ""
-    return Note("given jumps", len(jumps), "; ".join(steps[:MOST_JUMPS]) + more)
-
-
-def _without_steps(before: Floats, after: Floats, jumps: Ints) -> Floats:
-    """The poses (K, 4, 4) before, their steps from the rows `jumps` taken from those after."""
-    out = before.copy()
-    for k in jumps.tolist():
-        out[k + 1 :] = out[k] @ se3.inverse(after[k]) @ after[k + 1] @ se3.inverse(out[k + 1]) @ out[k + 1 :]
-    return out
-
-
-def _jumps(work: Work, key_frames: KeyFrames, after: Floats) -> tuple[Ints, int]:
-    """The rows of key frames from which the given path jumps to the next, the farthest first: steps unlike the refined
-    ones, times the factor of the others, and farther than those from what images show; without images, longer ones.
-    And how many of them are more than half as far as the first.
-
-    None where these are not a minority of the path: then it is another path.
-    """
-    firsts = first_of_steps(key_frames)
-    steps = [(se3.inverse(poses[firsts]) @ poses[firsts + 1])[:, :3, 3] for poses in (key_frames.world_from_key, after)]
-    lengths = np.linalg.norm(steps, axis=-1)
-    common = lengths.min(axis=0)  # of a jump, and of standing still, next to nothing
-    if not common.sum() > 0:
-        return firsts[:0], 1
-    factor = _weighted_median(lengths[1] / np.maximum(lengths[0], np.finfo(float).tiny), common)
-    off = np.linalg.norm(steps[1] - factor * steps[0], axis=1)
-    unlike = off > UNLIKE * np.maximum(factor * lengths[0], lengths[1])
-    if common[unlike].sum() > UNLIKE * common.sum():
-        return firsts[:0], 1
-    rows, off = firsts[unlike], off[unlike]
-    off_m = off_images_m(work, rows, key_frames.world_from_key, after)
-    known = np.isfinite(off_m).all(axis=0)
-    jumped = np.where(known, off_m[1] < off_m[0], factor * lengths[0, unlike] > lengths[1, unlike])
-    rows, off = rows[jumped], off[jumped]
-    return rows[np.argsort(-off)], max(int((off > UNLIKE * off.max(initial=0)).sum()), 1)
-
-
-def _weighted_median(values: Floats, weights: Floats) -> float:
-    order = np.argsort(values)
-    share = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(share, share[-1] / 2)])
 
 
 def _size_change(work: Work, before: Floats, after: Floats) -> tuple[list[Measure], list[Note]]:

@@ -21,6 +21,8 @@ OTHER_SCALE, EXPLAINED = 1.1, 0.25
 """The factor between the true path and the result from which one is not in metres, if scaling by it leaves less than a
 quarter of the error: focal lengths are known to a few per cent, and units differ by 5 or 1000.
 """
+MOST_NAMED = 5
+"""Frames without an edge that a note names: they fit on its line."""
 NOTHING_MOVED_M = 0.0005
 """The least movement that is reported, in a room."""
 
@@ -62,7 +64,8 @@ def other_scale(report: Report) -> Iterator[Note]:
         return
     x, y = x[rows] - x[rows].mean(axis=0), y[rows] - y[rows].mean(axis=0)
     scale = float(np.sum(x * y) / max(np.sum(x * x), np.finfo(float).tiny))
-    explained = np.sum((scale * x - y) ** 2) < EXPLAINED**2 * np.sum((x - y) ** 2)
+    left = np.sum((scale * x - y) ** 2)
+    explained = left < EXPLAINED**2 * min(np.sum((x - y) ** 2), np.sum(y**2))  # of a camera that stayed, nothing is
     if explained and (scale > OTHER_SCALE or 0 < scale < 1 / OTHER_SCALE):
         yield Note("other scale", detail=f"{float(f'{scale:.2g}'):g}")
 
@@ -70,9 +73,10 @@ def other_scale(report: Report) -> Iterator[Note]:
 def _graph_suspicions(graph: GraphSummary) -> Iterator[Note]:
     if len(graph.components) > 1:
         yield Note("parts", len(graph.components))
-    alone = sum(part.count == 1 for part in graph.components)
+    alone = [part.frames for part in graph.components if part.count == 1]
     if alone and graph.vertices > 1:
-        yield Note("alone", alone, str(graph.vertices))
+        named = ", ".join(alone[:MOST_NAMED]) + ", …" * (len(alone) > MOST_NAMED)
+        yield Note("alone", len(alone), f"{graph.vertices} frames ({named})")
     if graph.edges_ignored:
         yield Note("edges ignored", graph.edges_ignored, str(graph.edges))
     if suspect := graph.verdicts_in_use.get("suspect", 0):

@@ -118,4 +118,7 @@ def _decompose(csc: csc_matrix, ordering: str) -> SuperLU:
 
 
 def _singular(size: int) -> str:
-    return f"a linear system of {size} unknowns is singular: check for zero weights and unpinned components"
+    return (
+        f"the edges do not determine all {size} unknowns (a singular linear system): some have information that is "
+        "zero or almost zero on an axis: state some on each, or leave these edges out"
+    )

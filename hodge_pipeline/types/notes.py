@@ -143,8 +143,8 @@ LOOKS = {
     "given jumps": "The path given jumps at {count} {count:step|steps} ({detail}): the refined one has no such "
     "{count:step|steps}.",
     "other format": "poses are not written back into {detail}: refined.tum holds them",
-    "alone": "{count} of {detail} frames {count:has|have} no edge at all: {count:it keeps the pose it|they keep the "
-    "pose they} started with.",
+    "alone": "{count} of {detail} {count:has|have} no edge at all: {count:its pose is|their poses are} not measured, "
+    "in the files of poses too, where {count:it|they} may lie far from the others.",
     "wrong": "{count} of the edges used {count:is|are} judged wrong, {detail}: hodge diagnose shows them.",
     "untestable": "{count} of {detail} edges {count:is|are} untestable: nothing in the graph says whether {count:it "
     "is|they are} right.",
