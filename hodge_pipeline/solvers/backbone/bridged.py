@@ -32,6 +32,10 @@ agree on its break: with fewer, these are compared with motions, or ends, drawn 
 long as all else. In parts of four graphs of the literature by chance .08 to .35 agree, but for one of .5; of right ones
 .47 to .64 where 60 % of the motions are wrong, .21 to .35 where 90 % are; of RobotCar's .39, .48.
 """
+JUDGED_TWICE = 1000
+"""Most loops that are judged by stated errors too where learned ones are no more than a few times as large: a limit on
+cost.
+"""
 DRAWN = 3
 """Times that the motions, or the ends, of loops are drawn at random."""
 
@@ -103,7 +107,8 @@ def _as_stated(chain: Chain, found: Inferred, judge: Callable[..., Inferred | No
     motion like larger errors of all loops.
     """
     scales = found.scales.at_most_stated if chain.stated else Scales()
-    larger = chain.stated and found.scales.exceed_stated
+    larger = found.scales.surprise or found.scales.exceed_stated and len(chain.ends) <= JUDGED_TWICE
+    larger = chain.stated and larger
     return judge(chain, scales=scales) if found.scales != scales and (larger or not found.confirmed) else None
 
 
@@ -125,7 +130,7 @@ def _better(
     outliers: OutlierModel,
 ) -> tuple[Chain, Inferred] | None:
     """The chain with one more broken step bridged, and its loops judged; None where no step is broken."""
-    surprising = found.scales.steps_surprise or found.scales.loops_surprise or not found.confirmed
+    surprising = found.scales.surprise or not found.confirmed
     founds = [found] if as_stated is None or not surprising else [found, as_stated]
     for broken, least in [each for one in founds for each in _candidates(chain, one, outliers)]:
         tried = bridged(chain, broken)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -57,15 +57,14 @@ class Inferred:
         """By which the best of several answers is chosen."""
         return self.confirmed, self.of_places
 
-    @cached_property
-    def mistakes(self) -> list[Mistake]:
-        """Groups of unused loops that are mistaken in one way."""
+    def mistakes(self) -> Iterator[Mistake]:
+        """Groups of unused loops that are mistaken in one way: see `mistakes`."""
         return mistakes(self.linear, self.judged.log_wrong, self.used)
 
-    @property
+    @cached_property
     def of_mistakes(self) -> float:
         """By how many nats unused loops are likelier for these mistakes."""
-        return sum(each.nats for each in self.mistakes)
+        return sum(each.nats for each in self.mistakes())
 
     @cached_property
     def polished(self) -> tuple[Linear, Floats]:

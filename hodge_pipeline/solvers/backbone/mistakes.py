@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,26 +16,26 @@ from hodge_pipeline.types import Bools, Floats, Ints
 @dataclass(frozen=True)
 class Mistake:
     """Loops `rows (K,)` that agree with each other but for one motion of the world, and by how many nats they are
-    likelier for it, beside the place that tells this motion and its choice among all places.
+    likelier for it, beside the place that tells this motion and its choice among all places; 0 where they are not.
     """
 
     rows: Ints
     nats: float
 
 
-def mistakes(linear: Linear, log_wrong: Floats, used: Bools) -> list[Mistake]:
-    """Groups of the loops that are not `used (M,)`, each mistaken in one way; `log_wrong (M,)`: the log-density of each
-    residual at the poses of `linear` if the loop is wrong in a way of its own.
+def mistakes(linear: Linear, log_wrong: Floats, used: Bools) -> Iterator[Mistake]:
+    """Groups of the loops that are not `used (M,)`, each mistaken in one way, those first that most loops near them
+    agree with; `log_wrong (M,)`: the log-density of each residual at the poses of `linear` if the loop is wrong in a
+    way of its own.
     """
-    rows, out = np.flatnonzero(~used), list[Mistake]()
+    rows = np.flatnonzero(~used)
     if not len(rows):
-        return out
+        return
     pairwise = PairwiseConsistency.of(linear, log_wrong)
     fold = float(np.log((1 / loops_at_place(linear.chain.places[rows])).sum()))
     left = np.ones(len(rows), bool)
     for seed, factor in pairwise.seeds(rows):
         nats = float(pairwise.gains(seed, rows, factor)[left].sum()) - fold
+        yield Mistake(rows[left & (factor > 0)], max(nats, 0.0))
         if nats > 0:
-            out.append(Mistake(rows[left & (factor > 0)], nats))
             left &= factor <= 0
-    return out

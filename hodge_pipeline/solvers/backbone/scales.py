@@ -91,9 +91,9 @@ class Scales:
         return self.of_steps > SURPRISING
 
     @property
-    def loops_surprise(self) -> bool:
-        """Whether loops err more than what they state by over a standard deviation of the prior."""
-        return bool(max(self.loop_turn, self.loop_shift) > np.exp(FOLD))
+    def surprise(self) -> bool:
+        """Whether steps surprise, or loops err more than what they state by over a standard deviation of the prior."""
+        return bool(self.steps_surprise or max(self.loop_turn, self.loop_shift) > np.exp(FOLD))
 
     @property
     def exceed_stated(self) -> bool:

@@ -126,11 +126,12 @@ class Backbone:
     @property
     def _shared_mistake(self) -> str:
         """Where most unused loops agree on one shift: how many, and how far."""
-        found, most = self.found, max(self.found.mistakes, key=lambda each: len(each.rows), default=None)
-        if most is None or most.nats < BY_CHANCE or 2 * len(most.rows) < (~found.used).sum():
+        found = self.found
+        first = next(found.mistakes(), None)
+        if first is None or first.nats < BY_CHANCE or 2 * len(first.rows) < (~found.used).sum():
             return ""
-        away = np.linalg.norm(found.linear.loops[0][most.rows, self.chain.rotation_axes :], axis=1)
-        return f"; {len(most.rows)} others agree on a shift of {np.median(away):.3g} m: places that look alike"
+        away = np.linalg.norm(found.linear.loops[0][first.rows, self.chain.rotation_axes :], axis=1)
+        return f"; {len(first.rows)} others agree on a shift of {np.median(away):.3g} m: places that look alike"
 
 
 def find_backbone(
