@@ -104,7 +104,7 @@ def _as_stated(chain: Chain, found: Inferred, judge: Callable[..., Inferred | No
     motion like larger errors of all loops.
     """
     scales = found.scales.at_most_stated if chain.stated else Scales()
-    larger = found.scales.surprise or found.scales.exceed_stated and len(chain.ends) <= MOST_COMPARED
+    larger = found.scales.surprise or (found.scales.exceed_stated and len(chain.ends) <= MOST_COMPARED)
     larger = chain.stated and larger
     return judge(chain, scales=scales) if found.scales != scales and (larger or not found.confirmed) else None
 
