@@ -27,14 +27,15 @@ STATED = (0.5, 1.0, 3.0)
 
 
 def alike_cases(seed: int) -> Iterator[Case]:
-    """Walks with a loop in three steps, 30 to 70 % of which take a part of the world for the next."""
-    kinds = itertools.product(("storeys", "one lap a storey", "deck", "rows"), (0.3, 0.5, 0.7), NOISES, STATED)
-    for number, (kind, wrong, noise, stated) in enumerate(kinds):
+    """Walks with a loop in three steps, or one a step, 30 to 70 % of which take a part of the world for the next."""
+    worlds = ("storeys", "one lap a storey", "deck", "rows")
+    kinds = itertools.product((3, 1), worlds, (0.3, 0.5, 0.7), NOISES, STATED)
+    for number, (every, kind, wrong, noise, stated) in enumerate(kinds):
         rng = np.random.default_rng([seed, number])
         poses = _deck(rng) if kind == "deck" else _rows(rng) if kind == "rows" else _storeys(kind == "storeys", rng)
-        yield _case(
-            f"{kind}, {wrong:.0%} wrong, {noise[1]} m a step, stated × {stated}", poses, wrong, noise, stated, rng
-        )
+        name = f"{kind}, {wrong:.0%} wrong, {noise[1]} m a step, stated × {stated}"
+        name += ", a loop a step" if every == 1 else ""
+        yield _case(name, poses, len(poses) // every, wrong, noise, stated, rng)
 
 
 def _storeys(twice: bool, rng: np.random.Generator) -> Floats:
@@ -72,7 +73,13 @@ def _upright(places: Floats, yaw: Floats) -> Floats:
 
 
 def _case(
-    name: str, poses: Floats, wrong: float, noise: tuple[float, float], stated: float, rng: np.random.Generator
+    name: str,
+    poses: Floats,
+    loops: int,
+    wrong: float,
+    noise: tuple[float, float],
+    stated: float,
+    rng: np.random.Generator,
 ) -> Case:
     places, count = poses[:, :3, 3], len(poses)
     shift = np.array([0, ROW_M, 0]) if name.startswith("rows") else np.array([0, 0, STOREY_M])
@@ -82,7 +89,6 @@ def _case(
     is_right = (np.linalg.norm(apart, axis=1) < 1.5) if name.startswith(("storeys", "one")) else is_wrong.copy()
     if name.startswith("rows"):  # the row after the next one is taken for the next
         is_wrong = np.linalg.norm(apart - 2 * shift, axis=1) < 1.0
-    loops = count // 3
     good, bad = (_some(each, round(share * loops), rng) for each, share in ((is_right, 1 - wrong), (is_wrong, wrong)))
     edges = np.concatenate([np.stack([np.arange(count - 1), np.arange(1, count)]), np.stack([i, j])[:, good]], axis=1)
     edges = np.concatenate([edges, np.stack([i, j])[:, bad]], axis=1).T

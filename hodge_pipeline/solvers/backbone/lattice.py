@@ -52,7 +52,7 @@ def lattice_backbone(graph: ViewGraph, kept: Bools, doubted: Backbone | None = N
     backbone = doubted or find_backbone(graph, in_lattice=True)
     if backbone is None:
         return None, False
-    for_it, against = backbone.places(backbone.used & ~kept), backbone.places(kept & ~backbone.used)
+    for_it, against = backbone.places(backbone.used & ~kept), backbone.places_against(kept)
     unlikely = found.left_out if doubted or not backbone.found.confirmed else found.uncontradicted
     if against < PLACES_PER_WRONG_STEP * unlikely:
         return backbone, True

@@ -99,6 +99,16 @@ class Backbone:
         chosen = edges[np.concatenate([chain.loop_edge, chain.step_edge[at]])]
         return len(one_of_each_place(replace(chain, ends=ends).places[chosen]))
 
+    def places_against(self, edges: Bools) -> int:
+        """How many pairs of places those of the edges (E,) join that it leaves out, a shared shift counting as one."""
+        against, shifts = edges & ~self.used, 0
+        for each in self.found.mistakes():
+            rows = self.chain.loop_edge[each.rows]
+            if each.nats > BY_CHANCE and each.is_shift and against[rows].any():
+                against[rows] = False
+                shifts += 1
+        return self.places(against) + shifts if against.any() else shifts
+
     @property
     def loops_used(self) -> Bools:
         """Which loops (M,) count."""
