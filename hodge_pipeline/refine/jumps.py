@@ -6,9 +6,8 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.difference import length
-from hodge_pipeline.refine.against_images import first_of_steps, off_images_m
+from hodge_pipeline.refine.against_images import MOST_STEPS, first_of_steps, off_images_m
 from hodge_pipeline.refine.guard import Measure
-from hodge_pipeline.refine.image_steps import MOST_STEPS
 from hodge_pipeline.rounds.one_round import Work
 from hodge_pipeline.scene import KeyFrames, vertex_ids
 from hodge_pipeline.types import Floats, Ints
