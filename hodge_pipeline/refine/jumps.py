@@ -47,7 +47,8 @@ def sure_jumps(work: Work, key_frames: KeyFrames, after: Floats) -> tuple[Ints, 
     before_mm, after_mm = 1000 * off[:, sure].mean(axis=1)
     name, tolerance_mm = "steps at jumps off those of images", 1000 * usual_m
     measure = Measure(name, float(before_mm), float(after_mm), tolerance=tolerance_mm, unit="mm", is_held_out=True)
-    return rows[sure], without_steps(before, after, rows[sure], FAR * usual_m), [measure]
+    arm_m = se3.ARM_M * float(work.recipe.scale)
+    return rows[sure], without_steps(before, after, rows[sure], FAR * usual_m, arm_m), [measure]
 
 
 def jump_note(work: Work, before: Floats, after: Floats, jumps: Ints) -> Note:
@@ -61,18 +62,18 @@ def jump_note(work: Work, before: Floats, after: Floats, jumps: Ints) -> Note:
     return Note("given jumps", len(jumps), "; ".join(steps[:MOST_JUMPS]) + more)
 
 
-def without_steps(before: Floats, after: Floats, jumps: Ints, near_m: float = 0.0) -> Floats:
+def without_steps(before: Floats, after: Floats, jumps: Ints, near_m: float = 0.0, arm_m: float = se3.ARM_M) -> Floats:
     """The poses (K, 4, 4) before, their steps from the rows `jumps` taken from those after.
 
-    Where the next jump leads back, so that the motion over both is within `near_m` of the one after, only the poses
-    between them move: errors of two steps would put all others off.
+    Where the next jump leads back, so that the motion over both is within `near_m` of the one after, at this arm, only
+    the poses between them move: errors of two steps would put all others off.
     """
     out, left = before.copy(), np.sort(jumps).tolist()
     while left:
         k, end = left.pop(0), len(out)
         if left:
-            over = [(se3.inverse(poses[k]) @ poses[left[0] + 1])[:3, 3] for poses in (before, after)]
-            if np.linalg.norm(over[1] - over[0]) < near_m:
+            over = [se3.inverse(poses[k]) @ poses[left[0] + 1] for poses in (before, after)]
+            if se3.displacement_m(se3.inverse(over[0]) @ over[1], arm_m) < near_m:
                 end = left.pop(0) + 1
         step = se3.inverse(after[k]) @ after[k + 1]
         out[k + 1 : end] = out[k] @ step @ se3.inverse(out[k + 1]) @ out[k + 1 : end]
