@@ -18,10 +18,10 @@ UNLIKE, MOST_JUMPS = 0.5, 3
 """A step that differs from the refined one by more than half of the longer of the two is no scaled copy of it; jumps
 that a note names.
 """
-FAR, NEARER = 8.0, 4.0
+FAR, NEARER = 12.0, 4.0
 """Times the usual (median) step's error by images from which a given step is surely a jump, and times as near as it
-that the refined step must be. True steps are at most 3.5 times off as the median in a rendered room, 5 in red kitchen
-and fr1/rpy; a pose 30 cm off is 126 times.
+that the refined step must be. True steps over one frame to ten are up to 10 times as far off as the median in fr1/rpy,
+9 in red kitchen, 3 in fr1/xyz; a pose 30 cm off is 126 times.
 """
 
 
