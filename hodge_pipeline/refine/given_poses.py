@@ -19,7 +19,7 @@ from hodge_pipeline.refine.against_images import against_images, first_of_steps
 from hodge_pipeline.refine.conventions import explained
 from hodge_pipeline.refine.given_noise import without_noise
 from hodge_pipeline.refine.guard import SCORE_TOLERANCE, Decision, Measure, decide, mean_noise
-from hodge_pipeline.refine.jumps import jump_note, sure_jumps, without_steps
+from hodge_pipeline.refine.jumps import jump_note, sure_jumps
 from hodge_pipeline.refine.path_size import path_size
 from hodge_pipeline.refine.uncertainty import mean_chi2, pose_change
 from hodge_pipeline.rounds.one_round import Work
@@ -76,14 +76,14 @@ def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
     nothing = _nothing(last)
     if nothing or last.solution is None:
         return Decision("nothing", nothing), before
-    jumps, off_images = sure_jumps(work, key_frames, last.world_from_cam)
-    mended = without_steps(before, last.world_from_cam, jumps) if len(jumps) else before
+    jumps, mended, off_images = sure_jumps(work, key_frames, last.world_from_cam)
     smoothed = without_noise(
         last.graph, last.solution, mended, first_of_steps(key_frames), work.recipe.guard.shared_errors
     )
     solved = last.world_from_cam if smoothed is None or smoothed is mended else smoothed
     chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, solved)]
-    after, measures = _held_out(work, held_out_pairs(rounds), key_frames, spread_corrections(key_frames, solved, jumps))
+    found = spread_corrections(key_frames, solved, jumps)
+    after, measures, held_out = _held_out(work, held_out_pairs(rounds), key_frames, found)
     measures.append(chi2_measure(*chi2))
     moved = pose_change(last.graph, replace(last.solution, world_from_cam=after), before)
     decision = decide(measures, moved, force=work.recipe.guard.force)
@@ -91,6 +91,7 @@ def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
         return Decision("forced", convention, decision.measures, moved), after
     if len(jumps) and (decision.outcome == "optimal" or (decision.outcome == "refined" and smoothed is mended)):
         return _without_jumps(work, rounds, key_frames, mended, jumps, off_images)
+    work.steps.note(held_out)
     if decision.outcome == "refined" and smoothed is mended:
         return Decision("optimal", KEPT, decision.measures, moved), after
     if decision.outcome == "refined":  # so far by clouds alone, which a sensor may warp alike in every frame
@@ -109,10 +110,11 @@ def _without_jumps(
     """The decision on the given poses less their jumps (K, 4, 4), where nothing else of them is to be bettered."""
     last, before = rounds[-1], key_frames.world_from_key
     assert last.solution is not None
-    after, held_out = _held_out(work, held_out_pairs(rounds), key_frames, after[None])
+    after, measures, held_out = _held_out(work, held_out_pairs(rounds), key_frames, after[None])
+    work.steps.note(held_out)
     chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, after)]
     moved = pose_change(last.graph, replace(last.solution, world_from_cam=after), before)
-    decision = decide([*off_images, *held_out, chi2_measure(*chi2)], moved, force=work.recipe.guard.force)
+    decision = decide([*off_images, *measures, chi2_measure(*chi2)], moved, force=work.recipe.guard.force)
     if decision.outcome == "refined":
         work.steps.note(jump_note(work, before, after, jumps))
     return decision, after
@@ -177,13 +179,12 @@ def chi2_measure(before: float, after: float) -> Measure:
     return Measure("edge chi2, mean", before, after, tolerance=CHI2_TOLERANCE * before)
 
 
-def _held_out(work: Work, pairs: Ints, key_frames: KeyFrames, found: Floats) -> tuple[Floats, list[Measure]]:
-    """The first of the sets of poses (S, K, 4, 4) that fits the pairs held out of every round as well as the best, and
-    their score as a measure. Without such pairs the last set, and no measure.
+def _held_out(work: Work, pairs: Ints, key_frames: KeyFrames, found: Floats) -> tuple[Floats, list[Measure], Note]:
+    """The first of the sets of poses (S, K, 4, 4) that fits the pairs held out of every round as well as the best,
+    their score as a measure, and a note. Without such pairs the last set, and no measure.
     """
     if not len(pairs):
-        work.steps.note(Note("nothing held out", 0))
-        return found[-1], []
+        return found[-1], [], Note("nothing held out", 0)
     scale = float(work.recipe.scale)
     poses = np.stack([key_frames.world_from_key, *found])
     distances = work.steps.step(
@@ -196,9 +197,9 @@ def _held_out(work: Work, pairs: Ints, key_frames: KeyFrames, found: Floats) -> 
     mean_mm, mean = distances.mean(axis=1) * 1000, scores.mean(axis=1)
     apart = f"{mean_mm[0]:.3g} mm apart before, {mean_mm[1]:.3g} mm after"
     knots = f", the correction at every {KNOTS_APART[row - 1]}. key frame" if len(found) > 1 else ""
-    work.steps.note(Note("held out", len(pairs), apart + knots))
-    name = "score of held-out edges"
-    return found[row - 1], [Measure(name, float(mean[0]), float(mean[1]), "higher", tolerance, is_held_out=True)]
+    told, name = Note("held out", len(pairs), apart + knots), "score of held-out edges"
+    measure = Measure(name, float(mean[0]), float(mean[1]), "higher", tolerance, is_held_out=True)
+    return found[row - 1], [measure], told
 
 
 def _settled(work: Work, rounds: Sequence[Round]) -> list[Measure]:

@@ -18,35 +18,37 @@ UNLIKE, MOST_JUMPS = 0.5, 3
 """A step that differs from the refined one by more than half of the longer of the two is no scaled copy of it; jumps
 that a note names.
 """
-FAR, NEARER = 8.0, 4.0
+FAR, NEARER = 12.0, 4.0
 """Times the usual (median) step's error by images from which a given step is surely a jump, and times as near as it
-that the refined step must be. True steps are at most 3.5 times off as the median in a rendered room, 5 in red kitchen
-and fr1/rpy; a pose 30 cm off is 126 times.
+that the refined step must be. True steps over one frame to ten are up to 10 times as far off as the median in fr1/rpy,
+9 in red kitchen, 3 in fr1/xyz; a pose 30 cm off is 126 times.
 """
 
 
-def sure_jumps(work: Work, key_frames: KeyFrames, after: Floats) -> tuple[Ints, list[Measure]]:
-    """The rows of key frames from which the given path jumps to the next, by far more than images err, and how far the
-    steps there lie from images, before and after; none without images.
+def sure_jumps(work: Work, key_frames: KeyFrames, after: Floats) -> tuple[Ints, Floats, list[Measure]]:
+    """The rows of key frames from which the given path jumps to the next, by far more than images err; the given poses
+    (K, 4, 4) without these jumps; and how far the steps there lie from images, before and after. None without images.
 
     Pairs that are held out seldom touch a pose that is far off, since there it overlaps with nothing.
     """
+    before = key_frames.world_from_key
     rows, _ = jumps_of(work, key_frames, after)
     if not len(rows):
-        return rows, []
+        return rows, before, []
     firsts = first_of_steps(key_frames)
     firsts = firsts[evenly(len(firsts), MOST_STEPS)]
-    usual, off = (off_images_m(work, some, key_frames.world_from_key, after) for some in (firsts, rows))
+    usual, off = (off_images_m(work, some, before, after) for some in (firsts, rows))
     if not np.isfinite(usual).all(axis=0).any():
-        return rows[:0], []
+        return rows[:0], before, []
     usual_m = float(np.nanmedian(usual[1]))
     sure = (off[0] > FAR * usual_m) & (NEARER * off[1] < off[0])  # which NaN is not
     if not sure.any():
-        return rows[:0], []
+        return rows[:0], before, []
     before_mm, after_mm = 1000 * off[:, sure].mean(axis=1)
     name, tolerance_mm = "steps at jumps off those of images", 1000 * usual_m
     measure = Measure(name, float(before_mm), float(after_mm), tolerance=tolerance_mm, unit="mm", is_held_out=True)
-    return rows[sure], [measure]
+    arm_m = se3.ARM_M * float(work.recipe.scale)
+    return rows[sure], without_steps(before, after, rows[sure], FAR * usual_m, arm_m), [measure]
 
 
 def jump_note(work: Work, before: Floats, after: Floats, jumps: Ints) -> Note:
@@ -60,11 +62,21 @@ def jump_note(work: Work, before: Floats, after: Floats, jumps: Ints) -> Note:
     return Note("given jumps", len(jumps), "; ".join(steps[:MOST_JUMPS]) + more)
 
 
-def without_steps(before: Floats, after: Floats, jumps: Ints) -> Floats:
-    """The poses (K, 4, 4) before, their steps from the rows `jumps` taken from those after."""
-    out = before.copy()
-    for k in jumps.tolist():
-        out[k + 1 :] = out[k] @ se3.inverse(after[k]) @ after[k + 1] @ se3.inverse(out[k + 1]) @ out[k + 1 :]
+def without_steps(before: Floats, after: Floats, jumps: Ints, near_m: float = 0.0, arm_m: float = se3.ARM_M) -> Floats:
+    """The poses (K, 4, 4) before, their steps from the rows `jumps` taken from those after.
+
+    Where the next jump leads back, so that the motion over both is within `near_m` of the one after, at this arm, only
+    the poses between them move: errors of two steps would put all others off.
+    """
+    out, left = before.copy(), np.sort(jumps).tolist()
+    while left:
+        k, end = left.pop(0), len(out)
+        if left:
+            over = [se3.inverse(poses[k]) @ poses[left[0] + 1] for poses in (before, after)]
+            if se3.displacement_m(se3.inverse(over[0]) @ over[1], arm_m) < near_m:
+                end = left.pop(0) + 1
+        step = se3.inverse(after[k]) @ after[k + 1]
+        out[k + 1 : end] = out[k] @ step @ se3.inverse(out[k + 1]) @ out[k + 1 : end]
     return out
 
 

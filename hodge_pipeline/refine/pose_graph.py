@@ -31,7 +31,7 @@ from hodge_pipeline.store import artifacts
 from hodge_pipeline.store.edge_table import read_edges
 from hodge_pipeline.store.workspace import EDGES_FILE, GRAPH_FILE, SOLVED_FILE
 from hodge_pipeline.types import Bools, Floats, Solution, Source, Trajectory, ViewGraph
-from hodge_pipeline.types.text import command, counted
+from hodge_pipeline.types.text import command, counted, in_unit
 
 ROUNDING = 1e-15
 """Share of the first cost that rounding leaves of one that vanishes."""
@@ -233,9 +233,9 @@ def solve_file(path: Path, options: SolveOptions) -> SolvedFile:
     cpu_s, wall_s = time.process_time() - cpu_s, time.monotonic() - wall_s
     weights = np.zeros(len(off))
     weights[~off] = solution.weights
-    notes = (
-        (f"{counted(int(off.sum()), 'edge is|edges are')} disabled", *solution.notes) if off.any() else solution.notes
-    )
+    notes = tuple(in_unit(note, source.in_metres) for note in solution.notes)
+    if off.any():
+        notes = (f"{counted(int(off.sum()), 'edge is|edges are')} disabled", *notes)
     return SolvedFile(source, source.graph, replace(solution, weights=weights, notes=notes), options, cpu_s, wall_s)
 
 

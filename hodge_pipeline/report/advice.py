@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WORST_FIRST, WRONG, Diagnosis
 from hodge_pipeline.types import Bools, Ints
-from hodge_pipeline.types.text import UNKNOWN_UNIT
 
 SPLITS = 1 - 1e-6
 """Leverage from which an edge is a bridge of the graph."""
@@ -50,8 +47,3 @@ def _advice(verdict: str, is_disabled: bool, is_harmless: bool, in_no_listed_cyc
             else "look at the loop's edges, or register a pair across it"
         )
     return "keep it: without it the scene falls apart" if leverage >= SPLITS else "keep it"
-
-
-def in_unit(sentence: str, has_metres: bool) -> str:
-    """A sentence of a diagnosis, with its metres renamed where the unit of lengths is unknown."""
-    return sentence if has_metres else re.sub(r"(?<=\d) m\b", f" {UNKNOWN_UNIT}", sentence)

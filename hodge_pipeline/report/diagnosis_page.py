@@ -11,13 +11,13 @@ from hodge_pipeline.complex.components import in_runs
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.wording import TOO_LONG, cycle_error, name_cycle
 from hodge_pipeline.evaluation.difference import length
-from hodge_pipeline.report.advice import in_unit, ranked
+from hodge_pipeline.report.advice import ranked
 from hodge_pipeline.report.document import Banner, Document, Mark, Picture, Section, Table
 from hodge_pipeline.report.energy import CAVEAT, PARTS, EnergyRow
 from hodge_pipeline.report.tables import number
 from hodge_pipeline.rounds.suggestions import Suggestions
 from hodge_pipeline.types import Ints, ViewGraph
-from hodge_pipeline.types.text import counted
+from hodge_pipeline.types.text import counted, in_unit
 
 LISTED = 20
 CYCLES_EACH = 2

@@ -15,7 +15,6 @@ from hodge_pipeline.refine.model import refinable
 from hodge_pipeline.refine.model_options import load_model_refinement
 from hodge_pipeline.refine.model_solve import solve_bodies
 from hodge_pipeline.refine.pose_graph import read_graph
-from hodge_pipeline.report.advice import in_unit
 from hodge_pipeline.run_folder import Run
 from hodge_pipeline.scene import true_poses
 from hodge_pipeline.solvers.maximum_likelihood import solve
@@ -24,7 +23,7 @@ from hodge_pipeline.store.workspace import EDITS_FILE, is_run_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Frame, Solution, Source, ViewGraph
 from hodge_pipeline.types.axes import is_scanner
 from hodge_pipeline.types.edges import DISABLED, REJECTED, USED
-from hodge_pipeline.types.text import UNKNOWN_UNIT
+from hodge_pipeline.types.text import UNKNOWN_UNIT, in_unit
 from hodge_pipeline.types.tracked_model import TrackedModel
 
 LOG = "decisions.csv"

@@ -30,6 +30,11 @@ def visible(text: object, *, lines: bool = False) -> str:
     return (_LINES if lines else _ONE_LINE).sub(lambda found: ascii(found[0])[1:-1], str(text))
 
 
+def in_unit(sentence: str, has_metres: bool) -> str:
+    """A sentence of a diagnosis, with its metres renamed where the unit of lengths is unknown."""
+    return sentence if has_metres else re.sub(r"(?<=\d) m\b", f" {UNKNOWN_UNIT}", sentence)
+
+
 def with_symbols(text: str) -> str:
     """The text with each number that is one of gtsam's Symbols written as gtsam prints it: `a12`.
 

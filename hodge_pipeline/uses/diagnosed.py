@@ -15,7 +15,7 @@ from hodge_pipeline.diagnosis.result import WRONG, Diagnosis
 from hodge_pipeline.pairs.edits import joining, pair_names, read_history
 from hodge_pipeline.recipe.round_options import SuggestionOptions
 from hodge_pipeline.refine.pose_graph import read_graph
-from hodge_pipeline.report.advice import advice, in_unit, ranked
+from hodge_pipeline.report.advice import advice, ranked
 from hodge_pipeline.report.diagnosis_page import sentence
 from hodge_pipeline.report.energy import EnergyRow, energy_rows
 from hodge_pipeline.report.suspicions import NOTHING_MOVED_M
@@ -25,7 +25,7 @@ from hodge_pipeline.store.edge_table import read_edges
 from hodge_pipeline.store.workspace import EDGES_FILE, EDITS_FILE, SOLVED_FILE, is_run_folder
 from hodge_pipeline.types import Bools, CloudSet, Edges, Frame, Ints, ViewGraph
 from hodge_pipeline.types.edges import DISABLED, IGNORED, USED
-from hodge_pipeline.types.text import command
+from hodge_pipeline.types.text import command, in_unit
 
 if TYPE_CHECKING:
     from hodge_pipeline.report.contents import Report
@@ -165,7 +165,8 @@ class Diagnosed:
 def diagnose_subject(subject: DiagnosisSubject) -> Diagnosed:
     """The verdicts on every edge, and what follows from them."""
     found = diagnose(subject.graph, subject.options)
-    found = replace(found, reason=tuple(in_unit(reason, subject.has_metres) for reason in found.reason))
+    reason, told = (tuple(in_unit(each, subject.has_metres) for each in lines) for lines in (found.reason, found.notes))
+    found = replace(found, reason=reason, notes=told)
     pieces = int(found.piece.max(initial=-1)) + 1
     apart = f"poses.tum holds {pieces} pieces, each in a frame of its own: nothing sound connects them"
     energy, complaints = energy_rows(subject.graph, found.world_from_cam, found.piece, found.kept)
