@@ -208,6 +208,23 @@ def test_the_authors_poses(data_dir: Path) -> None:
     np.testing.assert_allclose(trajectory.world_from_cam[0, :3, 3], [0, 0, -2.25], atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("stated", "fy", "note"),
+    [((11.0, 12.0), 12.0, "intrinsics from"), ((481.2, 480.0), -480.0, "states ICL-NUIM's camera with y down")],
+)
+def test_a_camera_file_beside_the_authors_images_or_pov_files_counts(tmp_path: Path, stated, fy, note) -> None:
+    write_depth(tmp_path / "listed/depth/0.png", depth_values(0))
+    (tmp_path / "listed/livingRoom1.gt.freiburg").write_text(tum_line(0, some_poses(1)[0]))
+    write_colour(tmp_path / "listed/rgb/0.png")
+    for folder in (tmp_path / "listed", pov_folder(tmp_path / "kt0")):
+        file = folder / "camera-intrinsics.txt"
+        file.write_text(f"{stated[0]} 0 4\n0 {stated[1]} 3\n0 0 1\n")
+        source = IclNuimReader().open(folder)
+        assert (source.frames[0].camera.fx, source.frames[0].camera.fy) == (stated[0], fy)
+        assert file in source.files and any(note in told for told in source.notes)
+        assert IclNuimReader(camera=(5, 6, 4, 3)).open(folder).frames[0].camera.fy == 6
+
+
 def test_the_authors_images_without_their_list(tmp_path: Path) -> None:
     poses = some_poses(4)
     for number in range(3):

@@ -174,9 +174,9 @@ def diagnose_subject(subject: DiagnosisSubject) -> Diagnosed:
     notes = (
         *harmless,
         *((f"The robust solve left {gone} of the wrong edges out already.",) if gone else ()),
+        *((apart,) if pieces > 1 else ()),
         *subject.notes,
         *found.notes,
-        *((apart,) if pieces > 1 else ()),
         *_side_by_side(subject, found),
         *complaints,
     )
