@@ -225,6 +225,23 @@ def test_a_camera_file_beside_the_authors_images_or_pov_files_counts(tmp_path: P
         assert IclNuimReader(camera=(5, 6, 4, 3)).open(folder).frames[0].camera.fy == 6
 
 
+def test_identities_amid_the_truth_are_none(tmp_path: Path) -> None:
+    poses = some_poses(4)
+    poses[2] = np.eye(4)
+    for number in range(4):
+        write_depth(tmp_path / f"listed/depth/{number}.png", depth_values(number))
+        write_colour(tmp_path / f"listed/rgb/{number}.png")
+        write_depth(tmp_path / f"replica/results/depth{number}.png", depth_values(number))
+        write_colour(tmp_path / f"replica/results/frame{number}.png")
+    (tmp_path / "listed/livingRoom1.gt.freiburg").write_text("".join(tum_line(n, poses[n]) for n in range(4)))
+    np.savetxt(tmp_path / "replica/traj.txt", poses.reshape(4, 16))
+    for name in ("listed", "replica"):
+        source = IclNuimReader(camera=SMALL).open(tmp_path / name)
+        pose = source.frames[2].world_from_cam
+        assert pose is None or (name == "listed" and not np.allclose(pose, np.eye(4))), "a list is interpolated"
+        assert any("1 frame with the identity amid other poses" in note for note in source.notes), name
+
+
 def test_the_authors_images_without_their_list(tmp_path: Path) -> None:
     poses = some_poses(4)
     for number in range(3):

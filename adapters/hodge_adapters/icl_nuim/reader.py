@@ -26,6 +26,7 @@ from hodge_adapters.icl_nuim.pov import list_pov, pov_frames
 from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
 from hodge_adapters.images.fitted_camera import UNSTAMPED_STEP_S, assumed_camera_doubts
+from hodge_adapters.seven_scenes.files import placeholders, told_lost
 from hodge_adapters.text_rows import first_text
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_adapters.tum.image_lists import (
@@ -153,7 +154,7 @@ class IclNuimReader:
         trajectory, poses = None, np.full((len(listing.depth), 4, 4), np.nan)
         if truth:
             parsed = parse_tum(truth)
-            trajectory = parsed.trajectory
+            trajectory = _without_placeholders(parsed.trajectory, notes)
             notes.extend(parsed.notes)
             poses = se3.poses_at(trajectory, listing.stamps_s, MAX_GAP_FRAMES)
         without = int(np.isnan(poses[:, 0, 0]).sum())
@@ -254,6 +255,12 @@ def _sized(found: Intrinsics, listing: StampedImages) -> Intrinsics:
     colour = [path for path in listing.colour if path]
     sizes = [pixels.common_size(images) for images in (listing.depth, colour) if images]
     return replace(found, size=min(sizes, key=lambda size: abs(np.log(2 * found.cx / size[0])) if found.cx > 0 else 0))
+
+
+def _without_placeholders(truth: Trajectory, notes: list[str]) -> Trajectory:
+    lost = placeholders(truth.world_from_cam)
+    notes.extend([told_lost([f"{stamp:g}" for stamp in truth.stamps_s[lost]])] if lost.any() else [])
+    return Trajectory(truth.stamps_s[~lost], truth.world_from_cam[~lost])
 
 
 def _find_truth(folder: Path) -> Path | None:
