@@ -208,6 +208,40 @@ def test_the_authors_poses(data_dir: Path) -> None:
     np.testing.assert_allclose(trajectory.world_from_cam[0, :3, 3], [0, 0, -2.25], atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("stated", "fy", "note"),
+    [((11.0, 12.0), 12.0, "intrinsics from"), ((481.2, 480.0), -480.0, "states ICL-NUIM's camera with y down")],
+)
+def test_a_camera_file_beside_the_authors_images_or_pov_files_counts(tmp_path: Path, stated, fy, note) -> None:
+    write_depth(tmp_path / "listed/depth/0.png", depth_values(0))
+    (tmp_path / "listed/livingRoom1.gt.freiburg").write_text(tum_line(0, some_poses(1)[0]))
+    write_colour(tmp_path / "listed/rgb/0.png")
+    for folder in (tmp_path / "listed", pov_folder(tmp_path / "kt0")):
+        file = folder / "camera-intrinsics.txt"
+        file.write_text(f"{stated[0]} 0 4\n0 {stated[1]} 3\n0 0 1\n")
+        source = IclNuimReader().open(folder)
+        assert (source.frames[0].camera.fx, source.frames[0].camera.fy) == (stated[0], fy)
+        assert file in source.files and any(note in told for told in source.notes)
+        assert IclNuimReader(camera=(5, 6, 4, 3)).open(folder).frames[0].camera.fy == 6
+
+
+def test_identities_amid_the_truth_are_none(tmp_path: Path) -> None:
+    poses = some_poses(4)
+    poses[2] = np.eye(4)
+    for number in range(4):
+        write_depth(tmp_path / f"listed/depth/{number}.png", depth_values(number))
+        write_colour(tmp_path / f"listed/rgb/{number}.png")
+        write_depth(tmp_path / f"replica/results/depth{number}.png", depth_values(number))
+        write_colour(tmp_path / f"replica/results/frame{number}.png")
+    (tmp_path / "listed/livingRoom1.gt.freiburg").write_text("".join(tum_line(n, poses[n]) for n in range(4)))
+    np.savetxt(tmp_path / "replica/traj.txt", poses.reshape(4, 16))
+    for name in ("listed", "replica"):
+        source = IclNuimReader(camera=SMALL).open(tmp_path / name)
+        pose = source.frames[2].world_from_cam
+        assert pose is None or (name == "listed" and not np.allclose(pose, np.eye(4))), "a list is interpolated"
+        assert any("1 frame with the identity amid other poses" in note for note in source.notes), name
+
+
 def test_the_authors_images_without_their_list(tmp_path: Path) -> None:
     poses = some_poses(4)
     for number in range(3):

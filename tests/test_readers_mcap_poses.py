@@ -61,6 +61,18 @@ def test_odometry_on_another_clock_is_asked_about(tmp_path: Path) -> None:
     assert "2 of 2 frames have no pose within 0.2 s of their stamp: are they on another clock?" in notes
 
 
+@pytest.mark.parametrize("mounts", [(), ((100, "camera_link", OPTICAL, np.eye(4)),)])
+def test_transforms_that_nothing_links_to_the_camera_ask_for_the_static_ones(tmp_path: Path, mounts) -> None:
+    log = depth_log(some_images(2))
+    log.add("/tf_static", "tf2_msgs/msg/TFMessage", transforms(*mounts), CDR)
+    for row, pose in enumerate(some_poses(2)):
+        log.add("/tf", "tf2_msgs/msg/TFMessage", transforms((100 + row / 10, "odom", "base_link", pose)), CDR)
+    source = check_reader(McapReader(), log.write(tmp_path / "log.mcap"))
+    assert all(frame.world_from_cam is None for frame in source.frames)
+    told = f"no poses: no transform leads from base_link to {OPTICAL}, the camera's frame: record /tf_static too"
+    assert told in source.notes
+
+
 def test_odometry_of_a_body_that_nothing_links_to_the_camera(tmp_path: Path) -> None:
     log = depth_log(some_images(2))
     for row, pose in enumerate(some_poses(2)):

@@ -112,6 +112,21 @@ def test_a_frame_without_a_usable_pose_is_kept_and_noted(sequence: Path, text: s
     assert source.notes == ("1 frame without a usable pose (missing, not finite or not rigid): seq-01/000001",)
 
 
+@pytest.mark.parametrize(
+    ("identities", "lost"),
+    [((2,), (2,)), ((0, 2, 3), (0, 2, 3)), ((4, 5), (4, 5)), ((0, 1), ()), ((5,), ()), (range(6), ())],
+    ids=["between", "and at the first", "to the end", "first", "reversed", "all"],
+)
+def test_identities_amid_other_poses_are_none(tmp_path: Path, identities, lost) -> None:
+    folder = seven_scenes_sequence(tmp_path / "seq-01", count=6)
+    for row in identities:
+        (folder / f"frame-{row:06d}.pose.txt").write_text(pose_text(np.eye(4)))
+    source = SevenScenesReader().open(folder)
+    assert tuple(row for row, frame in enumerate(source.frames) if frame.world_from_cam is None) == lost
+    told = [note for note in source.notes if "identity" in note]
+    assert len(told) == bool(lost) and all(note.startswith(f"{len(lost)} frame") for note in told)
+
+
 def test_rotations_are_made_orthonormal(sequence: Path) -> None:
     pose = some_poses(3)[1]
     scaled = pose.copy()

@@ -17,6 +17,7 @@ from hodge_pipeline.review.opening import Review
 from hodge_pipeline.review.routes import PictureCache
 from hodge_pipeline.review.subject import open_for_review
 from hodge_pipeline.types import Floats
+from hodge_pipeline.uses.diagnosed import diagnose_subject, open_subject
 from test_readers_colmap_rigs import write_model
 
 
@@ -36,6 +37,14 @@ def synthetic(folder: Path, cameras: int, *, turned: bool = False) -> Path:
     folder.mkdir()
     model.write_binary(folder)
     return folder
+
+
+def test_poses_that_contradict_consistent_edges_are_told(tmp_path: Path) -> None:
+    good = diagnose_subject(open_subject(synthetic(tmp_path / "good", 1)))
+    off = diagnose_subject(open_subject(synthetic(tmp_path / "off", 1, turned=True)))
+    assert good.sentence == off.sentence and good.sentence.endswith("are consistent with each other.")
+    told = "the poses given contradict 7 of the 28 edges kept, most of those of camera000001_frame000000.png: "
+    assert off.notes[0].startswith(told) and not any("contradict" in note for note in good.notes)
 
 
 def centres(folder: Path) -> dict[str, Floats]:

@@ -237,6 +237,22 @@ def test_pieces_that_edges_left_out_joined_are_said_first(tmp_path: Path) -> Non
     assert parted.headline.startswith("Solved: chi2"), "the user parted them"
 
 
+@pytest.mark.parametrize(
+    ("joined", "begins"),
+    [
+        (range(5), "verdict Solved: chi2"),
+        ((0, 1, 4), "verdict In 2 pieces (3, 2 of 6 poses; 1 alone): solved: chi2"),
+        ((2,), "verdict 2 of 6 poses joined: solved: chi2"),
+        ((), "verdict Nothing to solve"),
+    ],
+)
+def test_pieces_that_no_edge_joins_are_said_first(tmp_path: Path, joined, begins) -> None:
+    vertices = [f"VERTEX_SE2 {i} {i} 0 0\n" for i in range(6)]
+    edges = [f"EDGE_SE2 {i} {i + 1} 1 0 0 1 0 0 1 0 1\n" for i in joined]
+    (tmp_path / "in.g2o").write_text("".join((*vertices, *edges)))
+    assert " ".join(hodge(tmp_path / "in.g2o").split()).startswith(begins)
+
+
 def test_edges_beside_consecutive_ones_are_counted_in_the_first_line(tmp_path: Path) -> None:
     made = drive(wrong=1.0, loops=20)
     steps = np.flatnonzero(np.diff(made.graph.edges, axis=1)[:, 0] == 1)

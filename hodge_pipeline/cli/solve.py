@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
+
 from hodge_pipeline.cli.console import ProgressBars, print_json
 from hodge_pipeline.cli.convert import check_result, keep_source, writer_name
 from hodge_pipeline.cli.options import Shown
@@ -13,6 +15,7 @@ from hodge_pipeline.errors import CheckError, RecipeError
 from hodge_pipeline.pairs.edits import read_history
 from hodge_pipeline.refine.pose_graph import SolvedFile, SolveOptions, solve_file, write_solved
 from hodge_pipeline.report.brief import LABEL, at_most, labelled
+from hodge_pipeline.report.verdict import in_pieces
 from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName
 from hodge_pipeline.solvers.newton import TIME_LIMIT_REACHED
@@ -119,7 +122,7 @@ def _lines(
     poses, edges, pieces = (counted(summary[f"{one}s"], one) for one in COUNTED)
     ignored = f", {summary['edges_ignored']} ignored" if summary["edges_ignored"] else ""
     shape = f"{summary['dimension']}-D, {poses}, {edges}{ignored}, {pieces}"
-    lines = [*labelled("verdict", solved.headline), f"  - {solved.source.name}: {shape}"]
+    lines = [*labelled("verdict", _headline(solved)), f"  - {solved.source.name}: {shape}"]
     if verbose:
         lines += [line for note in summary["notes"] for line in labelled("note", note)]
     else:
@@ -131,6 +134,16 @@ def _lines(
     lines += [f"{'written':<{LABEL}}{out}"] if out is not None else []
     lines += [f"{'report':<{LABEL}}{run_folder / PAGE_FILE}"] if run_folder is not None else []
     return [*lines, f"{'next':<{LABEL}}{command('hodge', 'diagnose', run_folder or solved.source.path)}"]
+
+
+def _headline(solved: SolvedFile) -> str:
+    """The verdict, after the pieces where no edge joins all poses, as on the page of a run."""
+    sizes = np.unique_counts(solved.solution.component).counts
+    joined = sorted(sizes[sizes > 1].tolist(), reverse=True)
+    if not joined or joined[0] == len(solved.solution.component) or solved.torn:
+        return solved.headline
+    pieces = in_pieces(joined, len(solved.solution.component), "poses")
+    return f"{pieces}: {solved.headline[:1].lower()}{solved.headline[1:]}"
 
 
 def _check(summary: dict[str, Any], start: InitialName) -> None:

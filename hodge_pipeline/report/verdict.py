@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -171,12 +171,18 @@ def _pieces(report: Report) -> str:
             return f"No two {of_all} joined, and {note.count} of {note.detail} pairs fit in several ways ({todo})"
         note = notes.get("none joined")
         return f"No two {of_all} joined" + (f" ({note.detail})" if note else "")
-    if len(sizes) > 1:
-        listed = [str(size) for size in sizes[:MOST_SIZES]] + ["…"] * (len(sizes) > MOST_SIZES)
-        alone = graph.vertices - sum(sizes)
-        return f"In {len(sizes)} pieces ({', '.join(listed)} {of_all}{f'; {alone} alone' if alone else ''})"
     told = sizes[0] < graph.vertices or report.source.unordered or report.source.kind == "scans"
-    return f"{sizes[0]} {of_all} joined" if told else ""
+    return in_pieces(sizes, graph.vertices, report.source.vertex_name) if told else ""
+
+
+def in_pieces(sizes: Sequence[int], vertices: int, name: str) -> str:
+    """In words the pieces that join at least two vertices, most first, and how many vertices are alone."""
+    of_all = f"of {vertices} {name}"
+    if len(sizes) == 1:
+        return f"{sizes[0]} {of_all} joined"
+    listed = [str(size) for size in sizes[:MOST_SIZES]] + ["…"] * (len(sizes) > MOST_SIZES)
+    alone = vertices - sum(sizes)
+    return f"In {len(sizes)} pieces ({', '.join(listed)} {of_all}{f'; {alone} alone' if alone else ''})"
 
 
 def _score_changes(report: Report) -> Iterator[Change]:

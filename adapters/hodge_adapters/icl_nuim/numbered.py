@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from hodge_adapters.association import unpaired_doubts
-from hodge_adapters.seven_scenes.files import FrameFiles, read_poses
+from hodge_adapters.seven_scenes.files import FrameFiles, placeholders, read_poses, told_lost
 from hodge_adapters.text_rows import listed, names_in, read_rows, read_text, to_floats
 from hodge_adapters.trajectories.log import read_log_file
 from hodge_adapters.tum.image_lists import StampedImages, find_colour_folder, stamped_images
@@ -134,9 +134,11 @@ def true_poses(path: Path, numbers: list[int], notes: list[str]) -> tuple[Floats
     if not values or len(values) % 16:
         raise SourceError(f"{file}: not sixteen numbers for each frame, a 4x4 matrix by rows: mend or remove it")
     rows = np.reshape(values, (-1, 4, 4))
-    rows = np.where(se3.is_motion(rows)[:, None, None], rows, np.nan)
+    lost = placeholders(rows)
+    rows = np.where((se3.is_motion(rows) & ~lost)[:, None, None], rows, np.nan)
     poses = _at(dict(enumerate(rows)), numbers)
     notes.append(f"the truth is {file.name}'s")
+    notes.extend([told_lost(np.flatnonzero(lost).tolist())] if lost.any() else [])
     without = int(np.isnan(poses[:, 0, 0]).sum())
     if without:
         notes.append(f"{without} of {len(poses)} frames have no truth in it")

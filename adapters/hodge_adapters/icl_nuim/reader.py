@@ -26,6 +26,7 @@ from hodge_adapters.icl_nuim.pov import list_pov, pov_frames
 from hodge_adapters.images import pixels
 from hodge_adapters.images.camera_files import Intrinsics, checked, find_camera_file, read_intrinsics
 from hodge_adapters.images.fitted_camera import UNSTAMPED_STEP_S, assumed_camera_doubts
+from hodge_adapters.seven_scenes.files import placeholders, told_lost
 from hodge_adapters.text_rows import first_text
 from hodge_adapters.trajectories.text import parse_tum
 from hodge_adapters.tum.image_lists import (
@@ -57,8 +58,8 @@ class IclNuimReader:
 
     camera: tuple[float, float, float, float] | None = Field(
         None,
-        description="fx fy cx cy in pixels; none: 481.2 -480 319.5 239.5; for Redwood's layout those of "
-        "a camera file in the folder, else 525 525 319.5 239.5",
+        description="fx fy cx cy in pixels; none: those of a camera file in the folder, else 481.2 -480 319.5 239.5, "
+        "for Redwood's layout 525 525 319.5 239.5",
     )
     depth_scale: float | None = Field(
         None,
@@ -123,6 +124,22 @@ class IclNuimReader:
     def _camera(self, default: Intrinsics) -> Intrinsics:
         return checked(Intrinsics(*self.camera), "option camera") if self.camera else default
 
+    def _icl_camera(self, path: Path, notes: list[str]) -> tuple[Intrinsics, tuple[Path, ...]]:
+        """That of a camera file in the folder, and the file; else ICL-NUIM's. One that states ICL-NUIM's own with y
+        down is taken with y up, as all its images and poses are.
+        """
+        file = None if self.camera else find_camera_file(path)
+        if file is None:
+            return ICL, ()
+        found = read_intrinsics(file)
+        if np.allclose((found.fx, found.fy), (ICL.fx, -ICL.fy), rtol=1e-3):
+            notes.append(
+                f"{file.name} states ICL-NUIM's camera with y down: fy = {ICL.fy:g} taken, since its y points up"
+            )
+            return replace(found, fy=-found.fy), (file,)
+        notes.append(f"intrinsics from {file.name}")
+        return found, (file,)
+
     def _open_lists(self, path: Path) -> Source:
         notes: list[str] = []
         return self._numbered(path, read_pairs(path, 0.0, notes), notes)
@@ -137,14 +154,17 @@ class IclNuimReader:
         trajectory, poses = None, np.full((len(listing.depth), 4, 4), np.nan)
         if truth:
             parsed = parse_tum(truth)
-            trajectory = parsed.trajectory
+            trajectory = _without_placeholders(parsed.trajectory, notes)
             notes.extend(parsed.notes)
             poses = se3.poses_at(trajectory, listing.stamps_s, MAX_GAP_FRAMES)
         without = int(np.isnan(poses[:, 0, 0]).sum())
         if without:
             notes.append(f"{without} of {len(poses)} frames have no truth")
-        frames = self._frames(listing, ICL, poses, ICL_UNITS_PER_METRE, notes, is_true=True)
-        files = (*listing.files, *filter(None, [truth]), *listing.depth, *filter(None, listing.colour))
+        camera, camera_files = self._icl_camera(path, notes)
+        frames = self._frames(listing, camera, poses, ICL_UNITS_PER_METRE, notes, is_true=True)
+        files = (
+            *listing.files, *camera_files, *filter(None, [truth]), *listing.depth, *filter(None, listing.colour)
+        )  # fmt: skip
         return Source(
             path.resolve().name,
             path,
@@ -176,7 +196,8 @@ class IclNuimReader:
     def _open_pov(self, path: Path, pov: dict[int, Path]) -> Source:
         notes: list[str] = []
         colours = [file for file in (depth.with_suffix(".png") for depth in pov.values()) if file.is_file()]
-        own = self._camera(ICL)
+        default, camera_files = self._icl_camera(path, notes)
+        own = self._camera(default)
         camera = own.camera_of(colours, notes) if colours else own.camera((640, 480))
         frames, files = pov_frames(pov, camera, self.depth_scale or 1.0, notes)
         every = tuple(frames[:: self.every])
@@ -186,7 +207,7 @@ class IclNuimReader:
             every,
             Trajectory.of_frames(frames),
             notes=tuple(notes),
-            files=files,
+            files=(*camera_files, *files),
             numbered_hz=VIDEO_HZ,
         )
 
@@ -234,6 +255,12 @@ def _sized(found: Intrinsics, listing: StampedImages) -> Intrinsics:
     colour = [path for path in listing.colour if path]
     sizes = [pixels.common_size(images) for images in (listing.depth, colour) if images]
     return replace(found, size=min(sizes, key=lambda size: abs(np.log(2 * found.cx / size[0])) if found.cx > 0 else 0))
+
+
+def _without_placeholders(truth: Trajectory, notes: list[str]) -> Trajectory:
+    lost = placeholders(truth.world_from_cam)
+    notes.extend([told_lost([f"{stamp:g}" for stamp in truth.stamps_s[lost]])] if lost.any() else [])
+    return Trajectory(truth.stamps_s[~lost], truth.world_from_cam[~lost])
 
 
 def _find_truth(folder: Path) -> Path | None:

@@ -118,14 +118,17 @@ def _from_transforms(
     tree = recording.transforms
     none = Poses(np.full((len(stamps_s), 4, 4), np.nan), None)
     camera_frame = camera_frame or options.child
+    of_camera = f"{camera_frame}, the camera's frame" if camera_frame else "the camera"
+    unlinked = f"no poses: no transform leads from {listed(tree.moving())} to {of_camera}: record /tf_static too"
     if camera_frame not in tree:
-        notes.append("no poses: neither odometry nor transforms of the camera")
+        notes.append(unlinked if tree.moving() else "no poses: neither odometry nor transforms of the camera")
         return none
     world = options.world_frame or tree.root(camera_frame)
     moving_s = tree.moving_stamps(world, camera_frame)
     of_frames, along = tree.lookup(world, camera_frame, stamps_s), tree.lookup(world, camera_frame, moving_s)
     if of_frames is None or along is None or not len(moving_s):
-        notes.append(f"no poses: no transforms in time lead from {world} to {camera_frame}")
+        is_apart = bool(tree.moving()) and not options.world_frame
+        notes.append(unlinked if is_apart else f"no poses: no transforms in time lead from {world} to {camera_frame}")
         return none
     notes.append(f"poses of {camera_frame} in {world} from the transforms")
     return Poses(of_frames, _finite(Trajectory(moving_s, along)))

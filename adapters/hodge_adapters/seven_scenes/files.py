@@ -16,7 +16,7 @@ from hodge_adapters.association import MISSING, unpaired_doubts
 from hodge_adapters.text_rows import listed, names_in, read_rows, read_text, to_floats
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types import Floats
+from hodge_pipeline.types import Bools, Floats
 from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.text import counted
 
@@ -145,15 +145,44 @@ def _list_numbers(folder: Path) -> dict[int, dict[str, Path]]:
 def read_poses(usable: Sequence[FrameFiles], notes: list[str]) -> Floats:
     """Poses (N, 4, 4) with rotations projected to SO(3), NaN where there is none that can be used."""
     poses = np.array([read_pose(files.paths.get("pose")) for files in usable])
+    sequences = np.array([files.sequence for files in usable])
+    lost = np.zeros(len(usable), bool)
+    for sequence in set(sequences.tolist()):
+        lost[sequences == sequence] = placeholders(poses[sequences == sequence])
+    poses[lost] = np.nan
+    if lost.any():
+        rows = np.flatnonzero(lost).tolist()
+        notes.append(told_lost([f"{usable[row].sequence}/{usable[row].number:06d}" for row in rows]))
     good = se3.is_motion(poses)
     poses[~good] = np.nan
     poses[good, :3, :3] = se3.project_to_so3(poses[good, :3, :3])
-    if not good.all():
-        bad = [f"{usable[row].sequence}/{usable[row].number:06d}" for row in np.flatnonzero(~good).tolist()]
+    if not (good | lost).all():
+        bad = [f"{usable[row].sequence}/{usable[row].number:06d}" for row in np.flatnonzero(~(good | lost)).tolist()]
         notes.append(
             f"{counted(len(bad), 'frame')} without a usable pose (missing, not finite or not rigid): {listed(bad)}"
         )
     return poses
+
+
+def placeholders(poses: Floats) -> Bools:
+    """The poses (N,) that are the identity to the last digit in a sequence that has it between other poses, or at two
+    frames after them: no camera comes back so exactly. At the first frames alone it is where the world begins.
+    """
+    rows = np.flatnonzero(np.isfinite(poses).all(axis=(1, 2)))
+    identity = (poses[rows] == np.eye(4)).all(axis=(1, 2))
+    others = np.flatnonzero(~identity)
+    first, last = (others[0], others[-1]) if len(others) else (len(rows), 0)
+    found = np.zeros(len(poses), bool)
+    found[rows] = identity & (identity[first:last].any() or identity[first:].sum() > 1)
+    return found
+
+
+def told_lost(frames: Sequence[object]) -> str:
+    """A note on the frames that had a placeholder."""
+    return (
+        f"{counted(len(frames), 'frame')} with the identity amid other poses, which trackers write where they lose "
+        f"the camera: taken as no pose: {listed(frames)}"
+    )
 
 
 def read_pose(path: Path | None) -> Floats:
