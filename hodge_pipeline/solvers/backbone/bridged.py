@@ -111,12 +111,11 @@ def _as_stated(chain: Chain, found: Inferred, judge: Callable[..., Inferred | No
 
 def _believed(as_stated: Inferred, found: Inferred) -> bool:
     """Whether loops judged with errors no larger than stated are to be believed rather than with learned ones: loops
-    that these explain by larger errors share a mistake, by more nats than their places tell.
+    that these explain by larger errors share a mistake.
     """
     if not as_stated.confirmed or not as_stated.start.chain.stated:
         return False
-    shared, told = as_stated.of_mistakes - found.of_mistakes, found.of_places - as_stated.of_places
-    return not found.confirmed or shared > max(told, BY_CHANCE)
+    return not found.confirmed or as_stated.of_mistakes > found.of_mistakes + BY_CHANCE
 
 
 def _better(
