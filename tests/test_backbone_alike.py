@@ -17,6 +17,8 @@ TOLD_BY = {
     "storeys, 70% wrong, 0.005 m a step, stated × 1.0": 3.0,  # a break that leads aside: all 100 were kept, 1.5 m off
     "one lap a storey, 30% wrong, 0.02 m a step, stated × 1.0": 3.0,  # the shared mistake: 14 were kept, 1.3 m off
     "rows, 50% wrong, 0.02 m a step, stated × 0.5": 1.5,  # likewise 64, 1.2 m
+    "rows, 50% wrong, 0.02 m a step, stated × 1.0": 1.5,  # errors learned twice as large: all 58 were kept
+    "storeys, 30% wrong, 0.005 m a step, stated × 1.0, a loop a step": 3.0,  # its cycles outvoted the backbone
 }
 
 
