@@ -138,7 +138,9 @@ def decided(measured: tuple[ViewGraph, Solution], given: Floats, monkeypatch: py
     better = Measure("score of held-out edges", 0.7, 0.8, "higher", 0.01, is_held_out=True)
     monkeypatch.setattr(given_poses, "spread_corrections", lambda key_frames, after, jumps: after)
     monkeypatch.setattr(given_poses, "_held_out", lambda work, pairs, key_frames, found: (found, [better]))
-    monkeypatch.setattr(given_poses, "sure_jumps", lambda *arguments: (np.zeros(0, np.int64), []))
+    monkeypatch.setattr(
+        given_poses, "sure_jumps", lambda work, keys, after: (np.zeros(0, np.int64), keys.world_from_key, [])
+    )
     monkeypatch.setattr(given_poses, "held_out_pairs", lambda rounds: [])
     for name in ("against_images", "path_size", "_settled"):
         monkeypatch.setattr(given_poses, name, lambda *arguments: [])
