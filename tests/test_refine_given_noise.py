@@ -137,14 +137,16 @@ def decided(measured: tuple[ViewGraph, Solution], given: Floats, monkeypatch: py
     graph, solution = measured
     better = Measure("score of held-out edges", 0.7, 0.8, "higher", 0.01, is_held_out=True)
     monkeypatch.setattr(given_poses, "spread_corrections", lambda key_frames, after, jumps: after)
-    monkeypatch.setattr(given_poses, "_held_out", lambda work, pairs, key_frames, found: (found, [better]))
+    monkeypatch.setattr(given_poses, "_held_out", lambda work, pairs, key_frames, found: (found, [better], None))
     monkeypatch.setattr(
         given_poses, "sure_jumps", lambda work, keys, after: (np.zeros(0, np.int64), keys.world_from_key, [])
     )
     monkeypatch.setattr(given_poses, "held_out_pairs", lambda rounds: [])
     for name in ("against_images", "path_size", "_settled"):
         monkeypatch.setattr(given_poses, name, lambda *arguments: [])
-    work = SimpleNamespace(recipe=SimpleNamespace(scale=1.0, guard=SimpleNamespace(force=False, shared_errors=SHARED)))
+    guard = SimpleNamespace(force=False, shared_errors=SHARED)
+    steps = SimpleNamespace(note=lambda *notes: None)
+    work = SimpleNamespace(recipe=SimpleNamespace(scale=1.0, guard=guard), steps=steps)
     key_frames = SimpleNamespace(world_from_key=given, sequence=np.zeros(COUNT), rows=np.arange(COUNT))
     last = SimpleNamespace(graph=graph, solution=solution, world_from_cam=solution.world_from_cam)
     return given_poses._decision(cast("Any", work), cast("Any", [last]), cast("Any", key_frames))
