@@ -49,7 +49,7 @@ def tail_gate(axes: int, share: float) -> float:
     return axes * float(fdtri(axes, FREEDOM, 1 - share))
 
 
-STUDENT_99 = {axes: tail_gate(axes, 0.01) for axes in (3, 6)}
+STUDENT_99 = {axes: tail_gate(axes, 0.01) for axes in (1, 2, 3, 6)}
 """The χ² gate of an edge, by its number of axes: the 99 % quantile under Student's t."""
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.chi2 import FREEDOM, tail_gate, tail_weight
+from hodge_pipeline.complex.chi2 import FREEDOM, STUDENT_99, tail_weight
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis, student_log_density
 from hodge_pipeline.solvers.backbone.fit import Fit
 from hodge_pipeline.solvers.backbone.linear import linearise, turned
@@ -21,8 +21,6 @@ MOST_UNUSUAL = 3
 """Steps that are tried by their own size alone: a limit on cost."""
 LEAST_COST = 4.0
 """Nats that the residual of a run must cost before its steps are tested: a limit on time."""
-RARE = 0.01
-"""Share of errors beyond which a step is turned, or leads aside."""
 
 
 @dataclass(frozen=True)
@@ -108,9 +106,9 @@ def _shifted_aside(pairwise: PairwiseConsistency, usual: StepModel, loop: int, a
     off = chain.log(chain.between(pairwise.linear.poses[at], end))
     ahead = chain.log(usual.centre)[shift]
     across = np.linalg.svd(ahead[:, None])[0][:, 1:].T
-    as_it_is = mahalanobis(off[:, turn], covariance[:, turn, turn])[0] < tail_gate(split, RARE)
+    as_it_is = mahalanobis(off[:, turn], covariance[:, turn, turn])[0] < STUDENT_99[split]
     aside = mahalanobis(off[:, shift] @ across.T, across @ covariance[:, shift, shift] @ across.T)[0]
-    return np.asarray(as_it_is & (aside > tail_gate(len(across), RARE)))
+    return np.asarray(as_it_is & (aside > STUDENT_99[len(across)]))
 
 
 def unusual_breaks(usual: StepModel) -> list[Break]:

@@ -7,18 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hodge_pipeline.complex.chi2 import tail_gate
+from hodge_pipeline.complex.chi2 import STUDENT_99
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis
 from hodge_pipeline.solvers.backbone.judge import by_path
 from hodge_pipeline.solvers.backbone.linear import Linear
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.types import Bools, Floats, Ints
-
-RARE = 0.01
-"""Share of right rotations beyond which loops are turned, and not only shifted."""
-MOST_COMPARED = 1000
-"""Loops among which shared mistakes are sought: a limit on cost. RobotCar's 2438 took 1.1 CPU s more, of 1.5."""
 
 
 @dataclass(frozen=True)
@@ -39,15 +34,14 @@ def mistakes(linear: Linear, log_wrong: Floats, used: Bools) -> Iterator[Mistake
     way of its own.
     """
     rows = np.flatnonzero(~used)
-    if not 0 < len(rows) <= MOST_COMPARED:
+    if not len(rows):
         return
     pairwise = PairwiseConsistency.of(linear, log_wrong)
     fold = float(np.log((1 / loops_at_place(linear.chain.places[rows])).sum()))
     left, split = np.ones(len(rows), bool), linear.chain.rotation_axes
-    gate = tail_gate(split, RARE)
     for seed, factor in pairwise.seeds(rows):
         nats = float(pairwise.gains(seed, rows, factor)[left].sum()) - fold
         chi2 = mahalanobis(linear.loops[0][[seed], :split], by_path(linear, np.array([seed]))[:, :split, :split])[0][0]
-        yield Mistake(rows[left & (factor > 0)], max(nats, 0.0), bool(chi2 < gate))
+        yield Mistake(rows[left & (factor > 0)], max(nats, 0.0), bool(chi2 < STUDENT_99[split]))
         if nats > 0:
             left &= factor <= 0

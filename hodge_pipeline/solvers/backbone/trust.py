@@ -111,7 +111,7 @@ class Backbone:
             if each.nats > BY_CHANCE and each.is_shift and against[rows].any():
                 against[rows] = False
                 shifts += 1
-        return self.places(against) + shifts if against.any() else shifts
+        return self.places(against) + shifts
 
     @property
     def loops_used(self) -> Bools:
