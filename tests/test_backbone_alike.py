@@ -9,6 +9,7 @@ from backbone_graphs import drive
 from benchmarks.alike_worlds import alike_cases
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.refine import pose_graph
+from hodge_pipeline.report.diagnosis_page import sentence
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.types import Edges, Source
 from hodge_pipeline.uses.diagnosed import DiagnosisSubject, diagnose_subject
@@ -27,8 +28,8 @@ def test_loops_that_take_a_part_of_the_world_for_the_next_are_left_out_and_told(
     case = next(each for each in alike_cases(1) if each.name == name)
     found = diagnose(case.graph)
     np.testing.assert_array_equal(found.kept, case.right)
-    (told,) = (note for note in found.notes if "others agree on a shift of" in note)
-    count, shift = told.split("; ")[-1].split(" others agree on a shift of ")
+    assert found.shared_mistake in found.notes and found.shared_mistake in sentence(case.graph, found)
+    count, shift = found.shared_mistake.split(" loops left out agree on a shift of ")
     assert int(count) == (~case.right).sum()
     assert float(shift.split(" m: places that look alike")[0]) == pytest.approx(TOLD_BY[name], abs=0.2)
 
@@ -41,12 +42,13 @@ def test_a_shift_without_a_scale_is_told_in_no_metres(monkeypatch: pytest.Monkey
     subject = DiagnosisSubject(source.path, "alike", case.graph, Edges.measured(case.graph), has_metres=False)
     for notes in (solved.solution.notes, diagnose_subject(subject).notes):
         assert any("agree on a shift of" in note and " units: places" in note for note in notes)
+    assert " units: places" in diagnose_subject(subject).sentence
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_random_loops_share_no_shift(seed: int) -> None:
     found = diagnose(drive(seed=seed, world="town", wrong=0.6).graph)
-    assert not any("others agree" in note for note in found.notes)
+    assert not found.shared_mistake
 
 
 def test_loops_that_shift_this_way_and_that_agree_on_none(data_dir: Path) -> None:
@@ -55,4 +57,4 @@ def test_loops_that_shift_this_way_and_that_agree_on_none(data_dir: Path) -> Non
     assert source.graph is not None
     backbone = find_backbone(source.graph)
     assert backbone is not None
-    assert "194 of 270 loops confirmed" in backbone.note and "agree" not in backbone.note
+    assert "194 of 270 loops confirmed" in backbone.notes[0] and not backbone.shared_mistake

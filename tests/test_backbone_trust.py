@@ -35,8 +35,8 @@ def test_trust_is_what_the_options_say() -> None:
     by_source, by_order = find_backbone(graph, "odometry"), find_backbone(graph, "sequential")
     assert by_source is not None and by_order is not None
     np.testing.assert_array_equal(by_source.used, by_order.used)
-    assert by_source.note.startswith("399 edges of odometry are trusted as a backbone")
-    assert by_order.note.startswith("399 consecutive edges are trusted as a backbone")
+    assert by_source.notes[0].startswith("399 edges of odometry are trusted as a backbone")
+    assert by_order.notes[0].startswith("399 consecutive edges are trusted as a backbone")
     with pytest.raises(GraphError, match="--trust gps: no edge comes from it; the edges come from odometry, places"):
         find_backbone(graph, "gps")
     with pytest.raises(ValueError, match="trust"):

@@ -168,7 +168,7 @@ class _ByCycles:
             cycles=cycles,
             witnesses=named_cycles,
             world_from_cam=world_from_cam,
-            tested=f"cycles: {int(cycles.closes.sum())} of {len(cycles.loops)} close",
+            tested=(f"cycles: {int(cycles.closes.sum())} of {len(cycles.loops)} close",),
         )
         information = _information(evidence.noise, there, stated.dimension == 2)
         notes = (*found.notes, *evidence.noise.doubts, *free_direction_notes(stated))

@@ -84,7 +84,7 @@ def _on_backbone(graph: ViewGraph, backbone: Backbone, solved: Solver) -> Soluti
     return replace(
         final,
         weights=backbone.used.astype(float),
-        notes=(backbone.note, *final.notes),
+        notes=(*backbone.notes, *final.notes),
         metrics={**final.metrics, "tested_edges": float(np.isfinite(backbone.chi2).sum())},
         confirmed=True if backbone.found.confirmed else None,
     )

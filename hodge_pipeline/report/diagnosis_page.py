@@ -93,6 +93,8 @@ def sentence(graph: ViewGraph, diagnosis: Diagnosis) -> str:
         worst = int(ranked(diagnosis)[0])
         i, j = graph.vertex_ids[graph.edges[worst]]
         told.append(f"{counts[WRONG]} {_are(counts[WRONG])} wrong, worst of all {i}–{j}")
+    if diagnosis.shared_mistake:
+        told.append(diagnosis.shared_mistake)
     if counts[SUSPECT]:
         told.append(f"{counts[SUSPECT]} {_are(counts[SUSPECT])} suspect")
     told += _untestable(graph, diagnosis)

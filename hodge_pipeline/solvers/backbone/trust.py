@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import expit
@@ -119,8 +120,12 @@ class Backbone:
         return self.used[self.chain.loop_edge]
 
     @property
-    def note(self) -> str:
-        """A line on which edges are trusted, and how many loops they confirm."""
+    def notes(self) -> tuple[str, ...]:
+        """Which edges are trusted, and how many loops they confirm; and `shared_mistake`."""
+        return self._trusted, *((self.shared_mistake,) if self.shared_mistake else ())
+
+    @property
+    def _trusted(self) -> str:
         loops, used, more = len(self.chain.loop_edge), int(self.loops_used.sum()), int(self.merged.sum())
         repeated = f" and {more} that state the same steps again" if more else ""
         trusted = f"{int(self.steps.sum()) - more} {self.named}{repeated} are trusted as a backbone"
@@ -135,11 +140,11 @@ class Backbone:
             errors = f"; these edges then err {scales.of_steps:.2g} times what they state, or the loops are wrong alike"
         else:
             errors = ""
-        return f"{trusted}{called_wrong}, {used} of {loops} loops confirmed{errors}{self._shared_mistake}"
+        return f"{trusted}{called_wrong}, {used} of {loops} loops confirmed{errors}"
 
-    @property
-    def _shared_mistake(self) -> str:
-        """Where most unused loops agree on one shift in the world's axes: how many, and how far."""
+    @cached_property
+    def shared_mistake(self) -> str:
+        """Where most unused loops agree on one shift in the world's axes: how many, and how far; else empty."""
         found, first = self.found, next(self.found.mistakes(), None)
         if first is None or first.nats < BY_CHANCE:
             return ""
@@ -151,7 +156,7 @@ class Backbone:
         alike = int((np.linalg.norm(shifts - usual, axis=1) < SAME_SHIFT * far_m).sum())
         if 2 * alike < (~found.used).sum():
             return ""
-        return f"; {alike} others agree on a shift of {far_m:.3g} m: places that look alike"
+        return f"{alike} loops left out agree on a shift of {far_m:.3g} m: places that look alike"
 
 
 def find_backbone(
