@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain as iterate_over
 from itertools import compress
 
 import numpy as np
 
 from hodge_pipeline.complex.chi2 import MEDIAN_CHI2
+from hodge_pipeline.solvers.backbone.bias import without_bias
 from hodge_pipeline.solvers.backbone.breaks import Break, Runs, agreed_breaks, unusual_breaks
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mixture
@@ -20,7 +22,7 @@ from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.places import MISTAKEN, MISTAKEN_PLACES, MOST_STEPS, agreeing_groups
-from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
+from hodge_pipeline.solvers.backbone.scales import Learned, Scales, learned_scales
 from hodge_pipeline.solvers.backbone.step_model import StepModel
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -47,18 +49,51 @@ def infer_bridged(
     most: int = MOST_BREAKS,
     is_sought: Callable[[Inferred], bool] = lambda unbroken: True,
 ) -> tuple[Chain, Inferred] | None:
-    """The chain with its paths joined and up to `most` broken steps bridged, and its loops judged; None as in `infer`.
+    """The chain with its paths joined, without the bias of its steps where this confirms loops, and with up to `most`
+    broken steps bridged, and its loops judged; None as in `infer`.
 
     A step is tried where loops of several places agree that it is broken, or where it is unlike all others. It is
     broken where all loops are likelier with a bridge in its place: by more than chance would have them be. `is_sought`:
     whether breaks should be sought, by the loops judged without any.
     """
-    chain = unbroken = joined(chain)
+    chain = joined(chain)
     outliers = OutlierModel.of(chain)  # one for all trials, which makes their evidence comparable
-    judge = partial(infer, outliers=outliers, trusted=trusted, may_thin=may_thin)
-    first = judge(chain)
-    if first is None:
-        return None
+    found = None
+    for unbroken, learned in _with_and_without_bias(chain, outliers):
+        judge = partial(infer, outliers=outliers, trusted=trusted, may_thin=may_thin)
+        first = judge(unbroken, learned=learned)
+        found = None if first is None else _broken(unbroken, first, judge, outliers, trusted, most, is_sought)
+        if found is None or found[1].confirmed:
+            break
+    return found
+
+
+def _with_and_without_bias(chain: Chain, outliers: OutlierModel) -> Iterator[tuple[Chain, Iterator[Learned]]]:
+    """The chain without the bias of its steps where this makes loops likelier by more than chance would, and as it is;
+    with the scales of its errors.
+    """
+    learned = learned_scales(chain, outliers)
+    first = next(learned)
+    unbiased = without_bias(chain, first.scales)
+    if unbiased is not None:
+        others = learned_scales(unbiased, outliers)
+        other = next(others)
+        if other.likelihood > first.likelihood + BY_CHANCE:
+            yield unbiased, iterate_over([other], others)
+    yield chain, iterate_over([first], learned)
+
+
+def _broken(
+    unbroken: Chain,
+    first: Inferred,
+    judge: Callable[..., Inferred | None],
+    outliers: OutlierModel,
+    trusted: Bools,
+    most: int,
+    is_sought: Callable[[Inferred], bool],
+) -> tuple[Chain, Inferred]:
+    """The chain with broken steps bridged, and its loops judged, which without were `first`; see `infer_bridged`."""
+    chain = unbroken
     as_stated = _as_stated(chain, first, judge)
     if as_stated is not None and _believed(as_stated, first):
         first, as_stated = as_stated, None
@@ -224,12 +259,13 @@ def joined(chain: Chain) -> Chain:
     than mistaken places have, or a single loop where hardly any is wrong. The evidence of two paths is kept while
     neither is joined to a third, and computed anew before joining ends.
     """
-    learned, evidence = None, dict[tuple[int, int], JoinEvidence]()
+    learned: Learned | None = None
+    evidence = dict[tuple[int, int], JoinEvidence]()
     while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
         poses = chain.poses
         outliers = OutlierModel.of(chain)
-        scales, shares = learned = learned or next(learned_scales(chain, outliers))
-        linear, rows = linearise(scales.applied(chain), poses), np.arange(len(chain.ends))
+        learned = learned or next(learned_scales(chain, outliers))
+        linear, rows = linearise(learned.scales.applied(chain), poses), np.arange(len(chain.ends))
         log_right, log_wrong = densities(linear, rows, outliers)
         pairwise, pairs = PairwiseConsistency.of(linear, log_wrong), chain.path[chain.ends]
         apart = pairs[:, 0] != pairs[:, 1]
@@ -240,7 +276,7 @@ def joined(chain: Chain) -> Chain:
         for both in two:
             if both not in evidence:
                 evidence[both] = JoinEvidence.of(pairwise, np.flatnonzero((pairs == both).all(axis=1)))
-        odds = float(np.log(shares[0] / shares[1]))
+        odds = float(np.log(learned.shares[0] / learned.shares[1]))
         scores = [evidence[both].best(mistaken, odds) for both in two]
         (score, loop), (low, high) = max(zip(scores, two, strict=True))
         if score > 0:

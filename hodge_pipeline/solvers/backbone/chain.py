@@ -38,6 +38,7 @@ class Chain:
     - `axes (p,)`: free axes of a twist, three in the plane; `stated`: the graph has information, not the identity that
       stands for unknown, and most steps constrain every axis.
     - `unit`: covariances are that identity, whichever end of an edge they are of; see `of_both_ends`.
+    - `bias (r,)`: the rotation that was taken out of each measured step; see `without_bias`.
     """
 
     order: Ints
@@ -53,6 +54,7 @@ class Chain:
     axes: Ints
     stated: bool
     unit: bool
+    bias: Floats
 
     @property
     def size(self) -> int:
@@ -91,6 +93,12 @@ class Chain:
         step[begins], covariance[begins] = np.eye(4), 0.0
         path = np.cumsum(begins) - 1
         return replace(self, path=path, step=step, step_covariance=covariance, bridged=self.broken)
+
+    def turned(self, by: Floats) -> Chain:
+        """The chain with a rotation (r,) more in each measured step."""
+        twist = np.zeros((self.size, len(self.axes)))
+        twist[self.inner & ~self.bridged, : len(by)] = by
+        return replace(self, step=self.compose(self.step, self.exp(twist)), bias=self.bias - by)
 
     @cached_property
     def poses(self) -> Floats:
@@ -213,6 +221,7 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
         axes,
         as_stated and not unit,
         unit,
+        np.zeros(int((axes < 3).sum())),
     )
 
 

@@ -62,7 +62,7 @@ class Linear:
 
 def shifted(covariance: Floats, lever: Floats) -> Floats:
     """Covariances (K, p, p) about the world's origin, in extended precision, about another: see `Chain.lever`."""
-    split = lever.shape[2]
+    covariance, split = np.asarray(covariance, float), lever.shape[2]
     turn, across = covariance[:, :split, :split], covariance[:, split:, :split]
     moved = across + lever @ turn
     out = np.empty(covariance.shape)

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import expit
 
+from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import chi2_by_information, has_unit_information, tail_gate, tail_weight
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.solvers.backbone.bridged import MOST_BREAKS, infer_bridged
@@ -76,7 +77,7 @@ class Backbone:
     named: str = "consecutive edges"
 
     def weighted(self, graph: ViewGraph) -> ViewGraph:
-        """The graph of the used edges, with information scaled to the errors that were learned."""
+        """The graph of the used edges, with information scaled to the errors that were learned, and without bias."""
         step, loop = self.found.scales.units(self.chain)
         width = np.ones((graph.edge_count, len(self.chain.axes)))
         width[self.steps] = step * LOCAL
@@ -94,7 +95,18 @@ class Backbone:
             rows = np.arange(graph.edge_count)[:, None, None]
             axes = rows, self.chain.axes[:, None], self.chain.axes
             information[axes] = inverse(self.chain.of_both_ends(graph.i_from_j, inverse(information[axes])))
-        return replace(graph, information=information).select(np.flatnonzero(self.used))
+        motions = self._without_bias(graph)
+        return replace(graph, i_from_j=motions, information=information).select(np.flatnonzero(self.used))
+
+    def _without_bias(self, graph: ViewGraph) -> Floats:
+        """The motions (E, 4, 4) of the graph's edges, those of steps without the bias that the chain lacks."""
+        if not self.chain.bias.any():
+            return graph.i_from_j
+        raw, edges = self.chain.turned(self.chain.bias).poses, np.argsort(self.chain.order)[graph.edges[self.steps]]
+        before, after = (se3.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]] for poses in (raw, self.chain.poses))
+        motions = graph.i_from_j.copy()
+        motions[self.steps] = motions[self.steps] @ se3.inverse(before) @ after
+        return motions
 
     def places(self, edges: Bools) -> int:
         """How many pairs of places these edges (E,) join; see `Chain.places`."""
@@ -140,6 +152,9 @@ class Backbone:
             errors = f"; these edges then err {scales.of_steps:.2g} times what they state, or the loops are wrong alike"
         else:
             errors = ""
+        if self.chain.bias.any():
+            turn_deg = np.degrees(np.linalg.norm(self.chain.bias))
+            errors += f"; a turn of {turn_deg:.2g}° that each of them has too much is taken out"
         return f"{trusted}{called_wrong}, {used} of {loops} loops confirmed{errors}"
 
     @cached_property
