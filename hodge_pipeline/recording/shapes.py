@@ -74,7 +74,7 @@ def strips(world_from_cam: Floats, sequences: np.ndarray[tuple[int, ...], np.dty
     return [np.asarray(world_from_cam[run, :3, 3], np.float32) for run in runs if len(run) and drawable[run[0]]]
 
 
-def pose_lines(world_from_cam: Floats, is_scanner: bool = False) -> Floats32:
+def pose_lines(world_from_cam: Floats, is_scanner: bool) -> Floats32:
     """One line (N, K, 3) for each pose: the frustum of a camera, x right and z forward; of a scanner an arrow along its
     x, under a mast along its z.
     """

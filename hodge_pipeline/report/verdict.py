@@ -71,9 +71,9 @@ class Verdict:
     headline: str
     details: str
     changes: tuple[Change, ...]
-    pieces: int = 1
-    reason: str = ""
-    is_doubtful: bool = False
+    pieces: int
+    reason: str
+    is_doubtful: bool
 
     @property
     def sentence(self) -> str:

@@ -138,7 +138,7 @@ class Bending:
             self._levels.append(_Level(layout, matrix, (bends.T @ stiffness @ bends).toarray()))
 
     def towards(
-        self, vertices: Ints, arms: Floats, known: Floats, covariances: Floats, least: float, finest: bool = False
+        self, vertices: Ints, arms: Floats, known: Floats, covariances: Floats, least: float, finest: bool
     ) -> Bent:
         """The poses bent to `known (P, 3)` points, each `arms (P, 3)` in the axes of one of the `vertices (P,)`; the
         factor on their sigma is `least` or more. `finest`: with the most nodes, whatever the evidence.

@@ -40,7 +40,7 @@ def image_frame(
     sequence: str = "",
     lens: Lens | None = None,
     colour_delay_s: float = 0.0,
-    colour_size: tuple[int, int] | None = None,
+    colour_size: tuple[int, int] | None,
 ) -> Frame:
     """A frame that reads its images when asked, and then refuses those of another size than the camera.
 
