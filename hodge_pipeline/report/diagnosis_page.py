@@ -21,6 +21,7 @@ from hodge_pipeline.types.text import counted, in_unit
 
 LISTED = 20
 CYCLES_EACH = 2
+"""Rows of a table, and cycles named in a row: what fits a page; `edges.csv` has all."""
 NONE = "none"
 MARKS: dict[str, Mark] = {WRONG: "worse", SUSPECT: "mixed", UNTESTABLE: "mixed", CONSISTENT: "better"}
 

@@ -24,6 +24,7 @@ MARKERS = {CONSISTENT: "s", UNTESTABLE: "D", SUSPECT: "^", WRONG: "X"}
 PART_COLOURS = ("#56b4e9", "#e69f00", "#444444")
 GAP_SHARE = 0.25
 FEW = 15
+"""Gap between pieces, as a share of the largest; and how many edges are still drawn large, each apart from the next."""
 
 
 def draw(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow], has_metres: bool) -> Iterator[Picture]:

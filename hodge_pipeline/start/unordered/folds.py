@@ -28,6 +28,7 @@ FOLDED_SHARE = 0.005
 CERTAIN = 2.0
 """Times `MOST_VIOLATION`: a violation that no noise explains."""
 MOST_CUTS = 6
+"""Each costs a diagnosis and a second of looking; pairs that then still contradict each other are reported."""
 SURE = np.inf
 
 
