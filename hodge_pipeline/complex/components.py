@@ -39,7 +39,7 @@ def first_of_component(component: Ints) -> Bools:
     return first
 
 
-def side_by_side(world_from_cam: Floats, component: Ints, space_m: float) -> Floats:
+def apart_along_x(world_from_cam: Floats, component: Ints, space_m: float) -> Floats:
     """The poses (V, 4, 4), the components moved along x so that each begins `space_m` beside the one before it."""
     out = np.array(world_from_cam, float)
     for number in range(1, int(component.max(initial=-1)) + 1):

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
-from hodge_pipeline.complex.components import side_by_side
+from hodge_pipeline.complex.components import apart_along_x
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.recording.shapes import VERDICT_COLOURS
 from hodge_pipeline.report.document import Picture
@@ -103,7 +103,7 @@ def pieces_apart(world_from_cam: Floats, piece: Ints) -> Floats:
     """The poses (V, 4, 4) with the components moved apart along x for a drawing; the largest stays."""
     first = world_from_cam[piece == 0, :3, 3]
     gap = max(GAP_SHARE * float(np.ptp(first, axis=0).max()), 0.1) if len(first) else 0.1
-    return side_by_side(world_from_cam, piece, gap)
+    return apart_along_x(world_from_cam, piece, gap)
 
 
 def _bars(figure: Figure, rows: Sequence[EnergyRow]) -> None:

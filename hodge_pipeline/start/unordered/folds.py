@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.components import connected_components, side_by_side
+from hodge_pipeline.complex.components import connected_components, apart_along_x
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import Diagnosis
@@ -145,4 +145,4 @@ def laid_apart(piece: Ints, piece_from: Floats, clouds: CloudSet) -> Floats:
     no cloud reaches another's.
     """
     first = np.unique(piece, return_index=True)[1]
-    return side_by_side(se3.inverse(piece_from[first])[piece] @ piece_from, piece, REACHES_APART * clouds.reach_m)
+    return apart_along_x(se3.inverse(piece_from[first])[piece] @ piece_from, piece, REACHES_APART * clouds.reach_m)
