@@ -27,7 +27,7 @@ from hodge_pipeline.registration.global_registrars import FpfhConsensus
 from hodge_pipeline.registration.odometry import OdometryOptions, odometry
 from hodge_pipeline.stages import GlobalRegistrar, Workers
 from hodge_pipeline.start.unordered.options import GlobalStart
-from hodge_pipeline.start.unordered.start import LocalDescriptors, all_pairs, similar_pairs
+from hodge_pipeline.start.unordered.start import SIMILARITY_VOXEL_M, LocalDescriptors, all_pairs, similar_pairs
 from hodge_pipeline.types import Ints
 
 REACH = 5
@@ -89,7 +89,7 @@ def main() -> None:
         for kind, registrar in registrars.items():
             own = folder / kind
             describe_clouds(folder, registrar, rows, own, workers)
-            local = LocalDescriptors(own, clouds, options.similarity_voxel_m)
+            local = LocalDescriptors(own, clouds, SIMILARITY_VOXEL_M)
             found, seconds = timed(lambda local=local: similar_pairs(local, rows, options, True))  # type: ignore[misc]
             cost[kind] = matching_s(own, registrar, all_pairs(rows), workers)
             row(f"all, matched by {kind}", all_pairs(rows), 0.0, cost[kind])

@@ -158,7 +158,7 @@ def test_edges_coloured_by_residual(tmp_path: Path) -> None:
     (colours,) = rows(part, layout.edges(1), "LineStrips3D:colors")
     (labels,) = rows(part, layout.edges(1), "LineStrips3D:labels")
     np.testing.assert_array_equal(np.float32(lines), np.float32(poses[graph.edges, :3, 3]))
-    expected = shapes.residual_colours(shapes.residuals_m(graph, poses), RecordingOptions().residual_scale_m)
+    expected = shapes.residual_colours(shapes.residuals_m(graph, poses))
     np.testing.assert_array_equal(rgb(colours), expected)
     assert labels[0].startswith("0 – 1: given, ") and labels[0].endswith(" mm")
     (grey,) = rows(part, layout.rejected(1), "LineStrips3D:strips")

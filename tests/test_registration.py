@@ -153,15 +153,36 @@ def test_information_is_the_second_derivative_of_the_point_to_plane_error() -> N
     np.testing.assert_allclose(found.information, expected, rtol=1e-5, atol=1e-6 * expected.max())
 
 
-def test_colours_hold_where_the_surface_slides() -> None:
-    rng = np.random.default_rng(3)
-    flat = np.column_stack([rng.uniform(-1, 1, (6000, 2)), np.full(6000, 2.0)])
+def test_ndt_comes_as_far_as_its_voxels_are_wide() -> None:
+    corner = np.random.default_rng(4).uniform(0, 3, (3, 4000, 3))
+    for axis, wall in enumerate(corner):
+        wall[:, axis] = 0
+    errors = {}
+    for side_m in (0.5, 0.02):
+        registrar = registry.load("registration", "ndt")(voxels_m=(side_m,))
+        prepared = registrar.prepare(PointCloud(np.float32(np.vstack(corner))))
+        errors[side_m] = np.abs(registrar.register(prepared, prepared, se3.exp(np.full(6, 0.05))).i_from_j[:3, 3]).max()
+    assert errors[0.5] < 0.005 < 0.04 < errors[0.02]
+
+
+def poster(count: int, seed: int) -> PointCloud:
+    """A plane with a pattern."""
+    flat = np.column_stack([np.random.default_rng(seed).uniform(-1, 1, (count, 2)), np.full(count, 2.0)])
     pattern = (np.sin(6 * flat[:, 0]) * np.cos(5 * flat[:, 1]) * 100 + 128).astype(np.uint8)
-    cloud = PointCloud(
-        flat.astype(np.float32),
-        np.tile(np.array([[0, 0, -1]], np.float32), (6000, 1)),
-        np.repeat(pattern[:, None], 3, axis=1),
-    )
+    normals = np.tile(np.array([[0, 0, -1]], np.float32), (count, 1))
+    return PointCloud(flat.astype(np.float32), normals, np.repeat(pattern[:, None], 3, axis=1))
+
+
+@pytest.mark.parametrize(("least_m", "off_m"), [(0.005, 0.04), (0.1, 0.0)])
+def test_colours_are_matched_so_far_apart_that_points_have_neighbours(least_m: float, off_m: float) -> None:
+    registrar = registry.load("registration", "coloured_icp")(distances_m=(0.005,), min_distance_m=least_m)
+    target, source = (registrar.prepare(poster(2000, seed)) for seed in (0, 1))
+    found = registrar.register(target, source, se3.exp(np.array([0, 0, 0, 0.04, 0, 0])))
+    assert found.i_from_j[0, 3] == pytest.approx(off_m, abs=0.002)
+
+
+def test_colours_hold_where_the_surface_slides() -> None:
+    cloud = poster(6000, 3)
     guess = se3.exp(np.array([0, 0, 0, 0.04, 0, 0]))
     results = {}
     for name in ("coloured_icp", "point_to_plane"):

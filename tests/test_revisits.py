@@ -56,6 +56,7 @@ def test_what_is_seen_again_is_found_and_registered(walk: tuple[CloudSet, Floats
     found = find_revisits(clouds, drifting(true, DRIFT), ONE, Revisits())
     i, j = found.pairs.T
     assert len(found) >= 10 and (j - i).min() > 15
+    assert 0 < len(find_revisits(clouds, drifting(true, DRIFT), ONE, Revisits(every_m=5.0))) < len(found)
     error = se3.log(se3.inverse(se3.inverse(true[i]) @ true[j]) @ found.i_from_j)
     assert np.linalg.norm(error[:, 3:], axis=1).max() < 0.05
     assert np.rad2deg(np.linalg.norm(error[:, :3], axis=1)).max() < 2

@@ -27,6 +27,7 @@ from hodge_pipeline.start.unordered.hypotheses import (
     LEAST_VIOLATION,
     MOST_VIOLATION,
     _ambiguous,
+    _Evidence,
     allowed_hue_conflict,
     allowed_violation,
 )
@@ -103,6 +104,12 @@ def test_a_motion_with_a_rival_that_fits_as_well_is_refused(turned: bool, is_kep
     told, one = np.array([0.02, 0.02]), np.zeros(1, np.int64)
     found = _ambiguous(edges, np.zeros(2, np.int64), one, told, np.array([90, 30]), HypothesisLimits())
     assert found.tolist() == [not is_kept]
+
+
+def test_how_much_two_scans_must_share_is_the_recipes_to_say() -> None:
+    told = _Evidence(*(np.array([share]) for share in (0.15, 0.0, 0.0, 0.01)), np.array([False]))
+    reasons = [told.reasons(np.zeros(1, np.int64), HypothesisLimits(min_overlap=least)).item() for least in (0.2, 0.1)]
+    assert reasons == ["too little overlap", ""]
 
 
 def unit(vectors: Floats) -> Floats:

@@ -36,7 +36,7 @@ class Pairs:
     disable: Sequence[str]
     enable: Sequence[str]
     register: Sequence[str]
-    right: Sequence[str] = ()
+    right: Sequence[str]
 
     def __bool__(self) -> bool:
         return bool(self.disable or self.enable or self.register or self.right)

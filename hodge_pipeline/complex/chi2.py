@@ -53,7 +53,7 @@ STUDENT_99 = {axes: tail_gate(axes, 0.01) for axes in (1, 2, 3, 6)}
 """The χ² gate of an edge, by its number of axes: the 99 % quantile under Student's t."""
 
 
-def student_weight(chi2: Floats, axes: int, *, usual: Floats, registered: bool = False) -> Floats:
+def student_weight(chi2: Floats, axes: int, *, usual: Floats, registered: bool) -> Floats:
     """The weight (E,) of each χ² in a robust solve: that of Student's t, 1 up to the expected χ² and 0 beyond its 99 %
     quantile. The median of `usual (N,)` gives the χ² their scale. Edges that are `registered` and kept have lighter
     tails, and none weighs 0.

@@ -8,7 +8,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components as csgraph_components
 
 from hodge_pipeline.complex.coboundary import check_edges
-from hodge_pipeline.types import Bools, Ints
+from hodge_pipeline.types import Bools, Floats, Ints
 from hodge_pipeline.types.text import counted
 
 MOST_PIECES_LISTED, MAX_RUNS_LISTED = 8, 12
@@ -37,6 +37,15 @@ def first_of_component(component: Ints) -> Bools:
     first = np.zeros(len(component), bool)
     first[np.unique(component, return_index=True)[1]] = True
     return first
+
+
+def apart_along_x(world_from_cam: Floats, component: Ints, space_m: float) -> Floats:
+    """The poses (V, 4, 4), the components moved along x so that each begins `space_m` beside the one before it."""
+    out = np.array(world_from_cam, float)
+    for number in range(1, int(component.max(initial=-1)) + 1):
+        rows = component == number
+        out[rows, 0, 3] += out[component == number - 1, 0, 3].max() + space_m - out[rows, 0, 3].min()
+    return out
 
 
 def describe_components(component: Ints, vertex_ids: NDArray[np.generic]) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ NEARER = 4.0
 read as they were meant it is at most 2.3; read the other way it is 5 to 12 of Intel, garage, EECS and Duderstadt.
 """
 FEWEST_CYCLES = 3
+"""The median of fewer is that of one or two cycles, which a single wrong edge decides."""
 ROUNDED = 1e-6
 """Share of the median edge length: closing errors below are those of rounded numbers."""
 

@@ -263,7 +263,7 @@ def loop_deviation(motions: Floats) -> Floats:
     return np.asarray(np.linalg.norm(motions - np.eye(4), axis=(-2, -1)))
 
 
-def adjusted_edges(edges: Ints, world_from_cam: Floats, correction: Floats, pairing: bool = False) -> Floats:
+def adjusted_edges(edges: Ints, world_from_cam: Floats, correction: Floats, pairing: bool) -> Floats:
     """The adjusted edges `A_ij = T_i⁻¹ exp(f_j − f_i) T_j` (E, 4, 4) of one Poisson step.
 
     `world_from_cam` are the poses before the step and `correction (V, 6)` is its f. Their loop deviation says how far

@@ -24,7 +24,7 @@ class Material:
     - `measurable`: whether a depth camera sees it; glass it does not.
     """
 
-    texture: str = "plain"
+    texture: str
     tint: Triple = WHITE
     tile_m: Triple = (1.0, 1.0, 1.0)
     glow: float = 0.0

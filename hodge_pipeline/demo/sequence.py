@@ -156,7 +156,7 @@ class World(Protocol):
         """Write the sequence into an empty folder; calls `advance(1)` after each frame."""
 
 
-def make_sequence(folder: Path | str, options: World | None = None, advance: Advance = no_progress) -> Path:
+def make_sequence(folder: Path | str, options: World | None, advance: Advance = no_progress) -> Path:
     """The folder with the sequence of these options, written unless it is there already.
 
     It is written beside the folder and renamed when complete, so that a killed process leaves no half of it.

@@ -29,7 +29,7 @@ class DistanceBlock:
     pairs: Ints
     i_from_j: Floats
     points: int
-    scale: float = 1.0
+    scale: float
 
 
 def block_distances(block: DistanceBlock) -> Floats:

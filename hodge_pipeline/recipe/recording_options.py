@@ -28,11 +28,6 @@ class RecordingOptions:
         description="10^6 bytes: bound on the file; 85 % of it for images, the rest for clouds, model and solver; 100 "
         "holds 650 VGA colour and depth images",
     )
-    residual_scale_m: float = Field(
-        default=0.05,
-        gt=0,
-        description="metres: residual at the bright end of the edges' colours; fixed, so that runs compare",
-    )
 
     def max_bytes(self, stage: str) -> int:
         """The bytes that a stage of `SHARES` may take."""

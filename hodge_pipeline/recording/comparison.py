@@ -25,7 +25,7 @@ def record_comparison(
     apart_m: Floats,
     text: str,
     *,
-    is_scanner: bool = False,
+    is_scanner: bool,
 ) -> None:
     """Write the recording; the poses (S, 4, 4) of the shared frames and the models are in one world already."""
     eye = look_from(poses[0], np.zeros((0, 3)), is_scanner)

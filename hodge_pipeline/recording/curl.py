@@ -59,7 +59,7 @@ def log_complex(part: Part, outer: int, graph: ViewGraph, start: Floats, solutio
     corners = solution.world_from_cam[triangles, :3, 3]
     drawable = np.flatnonzero(np.isfinite(corners).all(axis=(1, 2)))
     rows = drawable[np.argsort(curl_m[drawable], kind="stable")][evenly(len(drawable), kept)]
-    colours = shapes.residual_colours(curl_m[rows], part.options.residual_scale_m)
+    colours = shapes.residual_colours(curl_m[rows])
     if len(rows):
         alpha = np.full(len(rows), ALPHA, np.uint8)
         log_triangles(part.stream, layout.complex_mesh(outer), corners[rows], colours, alpha)

@@ -37,9 +37,9 @@ class Eye:
 class Eyes:
     """Viewpoints of the model, of the graph without it, and of the clouds of a pair in the axes of the first."""
 
-    room: Eye | None = None
-    graph: Eye | None = None
-    pair: Eye | None = None
+    room: Eye | None
+    graph: Eye | None
+    pair: Eye | None
 
 
 def look_at(model_chunks: Iterable[Chunk], pose_chunks: Iterable[Chunk], is_scanner: bool = False) -> Eye | None:

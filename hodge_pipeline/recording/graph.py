@@ -55,7 +55,7 @@ def log_poses(part: Part, name: str, world_from_cam: Floats, frames: Sequence[Fr
 def log_edges(part: Part, outer: int, graph: ViewGraph, world_from_cam: Floats, rejected: Edges | None) -> None:
     """Log edges coloured by residual, and rejected pairs with the reason."""
     residual_m = shapes.residuals_m(graph, world_from_cam)
-    colours = shapes.residual_colours(residual_m, part.options.residual_scale_m)
+    colours = shapes.residual_colours(residual_m)
     size, what = LINE_BYTES + LABEL_BYTES, f"edges of round {outer} drawn"
     rows = part.some(graph.edge_count, shapes.MOST_LINES, size, part.solver_bytes / 2, what)
     labels = [_label(graph, int(row), residual_m) for row in rows]
@@ -84,7 +84,7 @@ def log_solution(
         part.stream.send_columns(path, indexes, rr.Scalars.columns(scalars=values))
     if part.options.has_images:
         _log_film(part, outer, graph, states, residuals, first_iteration)
-    colours = shapes.residual_colours(residuals[-1], part.options.residual_scale_m)
+    colours = shapes.residual_colours(residuals[-1])
     colours[solution.weights == 0] = shapes.IGNORED_COLOUR
     what = f"solved edges of round {outer} drawn"
     lines = part.some(graph.edge_count, shapes.MOST_LINES, LINE_BYTES, part.solver_bytes / 4, what)
@@ -155,7 +155,7 @@ def _log_film(
     indexes = iteration_columns(outer, len(states), first_iteration, rows)
     if len(lines):
         strips = np.concatenate([shapes.segments(states[row], graph.edges[lines]) for row in rows])
-        colours = shapes.residual_colours(residuals[np.ix_(rows, lines)].reshape(-1), options.residual_scale_m)
+        colours = shapes.residual_colours(residuals[np.ix_(rows, lines)].reshape(-1))
         columns = rr.LineStrips3D.columns(strips=strips, colors=colours).partition([len(lines)] * len(rows))
         part.stream.send_columns(layout.FILM_EDGES, indexes, columns)
         part.stream.log(layout.FILM_EDGES, rr.LineStrips3D.from_fields(radii=[EDGE_RADIUS]), static=True)

@@ -133,7 +133,7 @@ def under(parent: str, name: str) -> str:
     return "/".join([parent, *(slug(part) for part in name.split("/"))])
 
 
-def part_name(number: int, stage: str, detail: str = "") -> str:
+def part_name(number: int, stage: str, detail: str) -> str:
     """The file name of a stage's part: its number gives the order of the run."""
     return f"{number:03d}-{stage}" + (f"-{slug(detail)}" if detail else "") + PART_SUFFIX
 

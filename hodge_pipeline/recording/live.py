@@ -27,6 +27,7 @@ PORT, WEB_PORT = 9876, 9090
 START_S = 60.0
 """That a viewer may take until it listens."""
 TIMEOUT_S = 120.0
+"""That a call of the viewer may take: twice what it may take to start."""
 
 
 class Live:

@@ -20,7 +20,9 @@ POINTS_SHOWN = 6_000
 TARGET_COLOUR, BEFORE_COLOUR, AFTER_COLOUR = (86, 180, 233), (230, 130, 0), (240, 228, 66)
 """Blue, orange and yellow of Okabe and Ito's set."""
 BINS = 30
+"""Of a histogram: the square root of a thousand pairs."""
 POINT_RADIUS = -1.0
+"""Negative, as all radii here: in pixels of the view, whatever the scene measures."""
 
 
 def log_registration(part: Part, outer: int, registered: Edges, guesses: Floats, clouds: CloudSet) -> None:

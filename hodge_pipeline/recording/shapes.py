@@ -33,6 +33,8 @@ TRAJECTORY_COLOURS = {
 
 MOST_LINES = 20_000
 """Lines in one picture of the graph: more is a solid block."""
+BRIGHT_M = 0.05
+"""Metres: the residual at the bright end of the edges' colours; fixed, so that iterations and runs compare."""
 LEAST_POSE_M, POSE_SHARE = 0.06, 0.02
 """Size of a drawn pose: metres at least, and a share of its trajectory's extent."""
 _CORNERS = np.array([[-0.8, -0.6, 1.0], [0.8, -0.6, 1.0], [0.8, 0.6, 1.0], [-0.8, 0.6, 1.0]])
@@ -46,7 +48,7 @@ def residuals_m(graph: ViewGraph, world_from_cam: Floats) -> Floats:
     return np.asarray(np.hypot(translation_m, se3.ARM_M * angle_rad))
 
 
-def residual_colours(residual_m: Floats, scale_m: float) -> Bytes:
+def residual_colours(residual_m: Floats, scale_m: float = BRIGHT_M) -> Bytes:
     """RGB (..., 3) of residuals: dark blue at 0, bright yellow from `scale_m` on and for NaN."""
     share = np.clip(np.nan_to_num(np.asarray(residual_m, float) / scale_m, nan=1.0), 0.0, 1.0)
     stops = np.linspace(0, 1, len(RESIDUAL_COLOURS))
@@ -72,7 +74,7 @@ def strips(world_from_cam: Floats, sequences: np.ndarray[tuple[int, ...], np.dty
     return [np.asarray(world_from_cam[run, :3, 3], np.float32) for run in runs if len(run) and drawable[run[0]]]
 
 
-def pose_lines(world_from_cam: Floats, is_scanner: bool = False) -> Floats32:
+def pose_lines(world_from_cam: Floats, is_scanner: bool) -> Floats32:
     """One line (N, K, 3) for each pose: the frustum of a camera, x right and z forward; of a scanner an arrow along its
     x, under a mast along its z.
     """

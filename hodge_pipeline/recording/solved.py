@@ -19,7 +19,7 @@ def record_graph(
     start: Floats,
     solution: Solution | None,
     sets: Mapping[str, Floats],
-    notes: Sequence[str] = (),
+    notes: Sequence[str],
     *,
     is_scanner: bool = False,
 ) -> tuple[str, ...]:

@@ -28,6 +28,7 @@ APPLICATION = "hodge-pipeline"
 TURN_S, STALLED_S = 2.0, 60.0
 """How long Rerun is waited for at a time, and after how long without a byte its writer counts as dead."""
 LEAST_FREE_BYTES = 1 << 16
+"""A disk with less free counts as full: a recording needs more for one image and its cloud."""
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,14 @@ better where it misses less than half of what this one does; still poses miss al
 better than their turns alone, too: poses of any wrong scale miss less where their lengths are next to nothing.
 """
 FEWEST_EDGES = 6
+"""So that their median stands though two of them are wrong."""
 SAME_RAD = 1e-6
 """Rotations nearer to each other are written alike."""
 TURNED_DEG = 1.0
 """The median turn of edges of a camera that turns: those of one that does not are registered to some tenths."""
 
 ROBOT_FROM_CAM = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+"""A camera has z ahead and y down, a robot x ahead and z up."""
 
 
 @dataclass(frozen=True)

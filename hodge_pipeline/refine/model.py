@@ -67,8 +67,8 @@ def refine_models(
     steps: Steps,
     key: str,
     *,
-    force: bool = False,
-    dask: str | None = None,
+    force: bool,
+    dask: str | None,
 ) -> tuple[RefinedModel, ...]:
     """Every model refined; models that measurements join become one. Nothing is written but the steps.
 

@@ -15,6 +15,7 @@ from hodge_pipeline.types.text import with_symbols
 
 COLUMNS, LINES, LABEL = 80, 10, 9
 FEWEST_POINTS, MOST_NOTES, MOST_OF_A_NOTE = 2, 2, 2
+"""A terminal of 80 columns shows ten lines beside what was typed: the reasons, doubts and next commands share them."""
 
 
 def brief(report: Report, folder: str) -> list[str]:

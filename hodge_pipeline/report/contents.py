@@ -150,7 +150,7 @@ class GraphSummary:
     edges: int
     edges_by_source: Mapping[str, int]
     components: tuple[ComponentRow, ...]
-    edges_ignored: int = 0
+    edges_ignored: int
     rejected: Mapping[str, int] = field(default_factory=dict)
     verdicts: Mapping[str, int] = field(default_factory=dict)
     verdicts_in_use: Mapping[str, int] = field(default_factory=dict)

@@ -17,10 +17,11 @@ from hodge_pipeline.report.energy import CAVEAT, PARTS, EnergyRow
 from hodge_pipeline.report.tables import number
 from hodge_pipeline.rounds.suggestions import Suggestions
 from hodge_pipeline.types import Ints, ViewGraph
-from hodge_pipeline.types.text import counted, in_unit
+from hodge_pipeline.types.text import counted, in_unit, suiting
 
 LISTED = 20
 CYCLES_EACH = 2
+"""Rows of a table, and cycles named in a row: what fits a page; `edges.csv` has all."""
 NONE = "none"
 MARKS: dict[str, Mark] = {WRONG: "worse", SUSPECT: "mixed", UNTESTABLE: "mixed", CONSISTENT: "better"}
 
@@ -92,11 +93,11 @@ def sentence(graph: ViewGraph, diagnosis: Diagnosis) -> str:
     if counts[WRONG]:
         worst = int(ranked(diagnosis)[0])
         i, j = graph.vertex_ids[graph.edges[worst]]
-        told.append(f"{counts[WRONG]} {_are(counts[WRONG])} wrong, worst of all {i}–{j}")
+        told.append(f"{counted(counts[WRONG], 'is|are')} wrong, worst of all {i}–{j}")
     if diagnosis.shared_mistake:
         told.append(diagnosis.shared_mistake)
     if counts[SUSPECT]:
-        told.append(f"{counts[SUSPECT]} {_are(counts[SUSPECT])} suspect")
+        told.append(f"{counted(counts[SUSPECT], 'is|are')} suspect")
     told += _untestable(graph, diagnosis)
     return "; ".join(told).replace(" ", f" of {graph.edge_count} edges ", 1) + "."
 
@@ -111,12 +112,9 @@ def _untestable(graph: ViewGraph, diagnosis: Diagnosis) -> list[str]:
     if len(blamed):
         told.append(f"{len(blamed)} may be to blame for {_failing_loops(graph, diagnosis, blamed)}")
     if alone:
-        one = alone == 1
-        told.append(
-            f"{alone} {'lies' if one else 'lie'} in no loop, so that nothing can test {'it' if one else 'them'}"
-        )
+        told.append(f"{counted(alone, 'lies|lie')} in no loop, so that nothing can test {suiting(alone, 'it|them')}")
     if long:
-        told.append(f"{long} {'lies' if long == 1 else 'lie'} in loops too long to be listed")
+        told.append(f"{counted(long, 'lies|lie')} in loops too long to be listed")
     return told
 
 
@@ -127,10 +125,6 @@ def _failing_loops(graph: ViewGraph, diagnosis: Diagnosis, blamed: Ints) -> str:
         name = name_cycle(graph, diagnosis.cycles, int(loops[0]))
         return f"the loop {name}, which {cycle_error(diagnosis.cycles, int(loops[0]))}: nothing says which edge it is"
     return "loops that fail: nothing says which edges they are"
-
-
-def _are(count: int) -> str:
-    return "is" if count == 1 else "are"
 
 
 def frames_table(graph: ViewGraph, diagnosis: Diagnosis) -> Table:

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
+from hodge_pipeline.complex.components import apart_along_x
 from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.recording.shapes import VERDICT_COLOURS
 from hodge_pipeline.report.document import Picture
@@ -23,6 +24,7 @@ MARKERS = {CONSISTENT: "s", UNTESTABLE: "D", SUSPECT: "^", WRONG: "X"}
 PART_COLOURS = ("#56b4e9", "#e69f00", "#444444")
 GAP_SHARE = 0.25
 FEW = 15
+"""Gap between pieces, as a share of the largest; and how many edges are still drawn large, each apart from the next."""
 
 
 def draw(graph: ViewGraph, diagnosis: Diagnosis, energy: Sequence[EnergyRow], has_metres: bool) -> Iterator[Picture]:
@@ -99,16 +101,9 @@ def _rarity(count: int) -> float:
 
 def pieces_apart(world_from_cam: Floats, piece: Ints) -> Floats:
     """The poses (V, 4, 4) with the components moved apart along x for a drawing; the largest stays."""
-    placed = np.array(world_from_cam)
-    first = placed[piece == 0, :3, 3]
+    first = world_from_cam[piece == 0, :3, 3]
     gap = max(GAP_SHARE * float(np.ptp(first, axis=0).max()), 0.1) if len(first) else 0.1
-    edge = -np.inf
-    for number in range(int(piece.max(initial=-1)) + 1):
-        rows = np.flatnonzero(piece == number)
-        if np.isfinite(edge):
-            placed[rows, 0, 3] += edge + gap - placed[rows, 0, 3].min()
-        edge = placed[rows, 0, 3].max()
-    return placed
+    return apart_along_x(world_from_cam, piece, gap)
 
 
 def _bars(figure: Figure, rows: Sequence[EnergyRow]) -> None:

@@ -108,7 +108,7 @@ class Banner:
 
     mark: Mark
     headline: str
-    points: tuple[str, ...] = ()
+    points: tuple[str, ...]
     word: str = ""
 
 

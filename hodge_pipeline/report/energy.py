@@ -15,6 +15,7 @@ from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 PARTS = ("exact", "co-exact", "harmonic")
 BEFORE, AFTER = "before", "after"
 MOST_EDGES = 50_000
+"""So many, half of them long loops, take 24 CPU s."""
 CAVEAT = (
     "energy shares are of ω = log(T_i Z_ij T_j⁻¹) at the robust poses, unit weights, world origin at the centroid of "
     "each piece; where residual motions are large ω is only their linearisation, and wrong edges dominate it"

@@ -9,7 +9,7 @@ import numpy as np
 from hodge_pipeline.evaluation.cloud_distance import NO_NEIGHBOUR_M, REACH_M
 from hodge_pipeline.evaluation.difference import length
 from hodge_pipeline.report import known_positions
-from hodge_pipeline.report.contents import GRAPH_NAMES, TRUTH, GraphSummary, Report, TrajectoryRow
+from hodge_pipeline.report.contents import GRAPH_NAMES, TRUTH, GraphSummary, Report, TrajectoryRow, WrongEdges
 from hodge_pipeline.rounds.settling import settled_m
 from hodge_pipeline.types.notes import Note
 
@@ -30,12 +30,12 @@ NOTHING_MOVED_M = 0.0005
 def suspicions(report: Report) -> tuple[Note, ...]:
     """What a reader should distrust and what else is to be known, by rank; the run's own notes come first in each."""
     found = (
-        *unsettled(report),
-        *other_scale(report),
+        *_unsettled(report),
+        *_other_scale(report),
         *(() if report.position_fit is None else known_positions.notes(report.position_fit)),
         *report.notes,
         *(() if report.graph is None else _graph_suspicions(report.graph)),
-        *wrong_edges(report),
+        *_wrong_edges(report),
         *_edge_suspicions(report),
         *_above_truth(report),
         *_unmatched(report),
@@ -44,14 +44,14 @@ def suspicions(report: Report) -> tuple[Note, ...]:
     return tuple(sorted(found, key=lambda note: note.rank))
 
 
-def unsettled(report: Report) -> Iterator[Note]:
+def _unsettled(report: Report) -> Iterator[Note]:
     """A note where the last round moved the poses too far."""
     after = [path.positions for path in report.pictures.paths if path.name == report.after] or [np.zeros((0, 3))]
     if report.last_shift_m is not None and report.last_shift_m > settled_m(after[0], report.scale):
         yield Note("unsettled", detail=length(report.last_shift_m))
 
 
-def other_scale(report: Report) -> Iterator[Note]:
+def _other_scale(report: Report) -> Iterator[Note]:
     """A note where the true path is a scaled copy of the result's, in the largest component."""
     paths = {path.name: path.positions for path in report.pictures.paths}
     if not report.has_metres or TRUTH not in paths or report.after not in paths:
@@ -85,12 +85,12 @@ def _graph_suspicions(graph: GraphSummary) -> Iterator[Note]:
         yield Note("untestable", untestable, str(graph.edges))
 
 
-def wrong_edges(report: Report) -> Iterator[Note]:
+def _wrong_edges(report: Report) -> Iterator[Note]:
     """A note on the edges judged wrong, by their effect on the poses."""
     wrong = report.wrong_edges
     if wrong is None or not wrong.count:
         return
-    moved = report.length(max(wrong.moved_m, NOTHING_MOVED_M * report.scale))
+    moved = moved_without(wrong, report)
     if not wrong.matters(report.scale):
         yield Note("harmless", wrong.count, f"{wrong.frames}; without them no pose moves by more than {moved}")
     elif wrong.pieces_more:
@@ -99,6 +99,11 @@ def wrong_edges(report: Report) -> Iterator[Note]:
         )
     else:
         yield Note("wrong", wrong.count, f"{wrong.frames}; without them poses move by up to {moved}")
+
+
+def moved_without(wrong: WrongEdges, report: Report) -> str:
+    """By how much poses move without the wrong edges."""
+    return report.length(max(wrong.moved_m, NOTHING_MOVED_M * report.scale))
 
 
 def _above_truth(report: Report) -> Iterator[Note]:

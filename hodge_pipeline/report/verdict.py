@@ -10,7 +10,7 @@ import numpy as np
 
 from hodge_pipeline.evaluation.difference import MEASURABLE, Change
 from hodge_pipeline.report.contents import GRAPH_NAMES, Report
-from hodge_pipeline.report.suspicions import other_scale, unsettled, wrong_edges
+from hodge_pipeline.report.suspicions import suspicions
 from hodge_pipeline.types.notes import Note
 
 Outcome: TypeAlias = Literal["improved", "unchanged", "worse", "mixed", "not measured"]
@@ -56,7 +56,7 @@ REASONS = {
 }
 """By kind of note, what a headline begins with (`LEADS`; those `OF_MOST` frames from `MOSTLY_LOST` on), and the reasons
 of `in doubt, since …` (`REASONS`), whatever the measures say."""
-OF_MOST = {"tracking lost", "images unread"}
+OF_MOST = {"tracking lost", "images unread", "untestable"}
 MOSTLY_LOST = 0.5
 """The share of the frames; of edges that nothing confirms, of the edges."""
 
@@ -71,9 +71,9 @@ class Verdict:
     headline: str
     details: str
     changes: tuple[Change, ...]
-    pieces: int = 1
-    reason: str = ""
-    is_doubtful: bool = False
+    pieces: int
+    reason: str
+    is_doubtful: bool
 
     @property
     def sentence(self) -> str:
@@ -106,17 +106,14 @@ def judge(report: Report) -> Verdict:
     if pieces:
         all_joined = report.source.unordered and len(report.pieces) == 1 and outcome in ("improved", "unchanged")
         headline = pieces if all_joined else f"{pieces}: {headline[:1].lower()}{headline[1:]}"
-    told = sorted(
-        (*unsettled(report), *other_scale(report), *report.notes, *wrong_edges(report), *_mostly_untestable(report)),
-        key=lambda note: note.rank,
-    )
+    told = suspicions(report)
     apart = {"left apart"} if len(report.pieces) > 1 else set()  # then nothing joins them, and the headline says so
     reasons = " and ".join(REASONS[note.kind] for note in told if note.kind in REASONS.keys() - apart)
     frames = report.source.frames
     doubts = [
         LEADS[note.kind].format(count=note.count, detail=note.detail, frames=frames)
         for note in told
-        if note.kind in LEADS and (note.kind not in OF_MOST or note.count > MOSTLY_LOST * frames)
+        if note.kind in LEADS and (note.kind not in OF_MOST or _is_most(note, frames))
     ]
     doubts += [f"in doubt, since {reasons}"] if reasons else []
     doubts += [report.refinement.doubt] if report.refinement and report.refinement.doubt else []
@@ -124,12 +121,9 @@ def judge(report: Report) -> Verdict:
     return Verdict(outcome, headline, details, changes, max(len(report.pieces), 1), reason, bool(doubts))
 
 
-def _mostly_untestable(report: Report) -> Iterator[Note]:
-    """A note where nothing confirms most edges, as in a tree."""
-    graph = report.graph
-    count = 0 if graph is None else graph.verdicts.get("untestable", 0)
-    if graph is not None and count > MOSTLY_LOST * graph.edges:
-        yield Note("untestable", count, str(graph.edges))
+def _is_most(note: Note, frames: int) -> bool:
+    """Whether a note is on most of the frames, or of the edges, of which nothing confirms those of a tree."""
+    return note.count > MOSTLY_LOST * (int(note.detail) if note.kind == "untestable" else frames)
 
 
 def _judged(report: Report, changes: tuple[Change, ...]) -> tuple[Outcome, str, str]:

@@ -44,10 +44,10 @@ class Settled:
     weights: Floats
     residual_m: Floats
     residual_rad: Floats
-    seconds: float = 0.0
-    moved_m: float = 0.0
-    error_m: float | None = None
-    converged: bool = True
+    seconds: float
+    moved_m: float
+    error_m: float | None
+    converged: bool
 
 
 @dataclass(frozen=True)

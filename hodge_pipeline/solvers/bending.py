@@ -19,6 +19,7 @@ from scipy.sparse import coo_matrix, csr_matrix, kron
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import residual_twists
+from hodge_pipeline.complex.one_form import shifted
 from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 MOST_PIECES = 96
@@ -129,7 +130,7 @@ class Bending:
         places = rest[np.concatenate(pieces), :3, 3]
         self._graph, self._centre = graph, places.mean(axis=0)
         self._size_m = max(float(np.linalg.norm(np.ptp(places, axis=0))), 1e-9)
-        self._rest = _shifted(rest, -self._centre)
+        self._rest = shifted(rest, -self._centre)
         stiffness, _ = self._stiffness(self._rest)
         self._levels: list[_Level] = []
         for layout in _layouts(rest, pieces):
@@ -138,7 +139,7 @@ class Bending:
             self._levels.append(_Level(layout, matrix, (bends.T @ stiffness @ bends).toarray()))
 
     def towards(
-        self, vertices: Ints, arms: Floats, known: Floats, covariances: Floats, least: float, finest: bool = False
+        self, vertices: Ints, arms: Floats, known: Floats, covariances: Floats, least: float, finest: bool
     ) -> Bent:
         """The poses bent to `known (P, 3)` points, each `arms (P, 3)` in the axes of one of the `vertices (P,)`; the
         factor on their sigma is `least` or more. `finest`: with the most nodes, whatever the evidence.
@@ -164,7 +165,7 @@ class Bending:
                 break
         spread = np.asarray(np.linalg.inv(hessian) * point_factor**2).reshape(layout.count, 6, layout.count, 6)
         edge_factor = float(np.sqrt(softness)) * point_factor
-        return Bent(_shifted(poses, self._centre), edge_factor, point_factor, spread, self._centre, layout)
+        return Bent(shifted(poses, self._centre), edge_factor, point_factor, spread, self._centre, layout)
 
     def _likeliest(self, points: Points, least: float, levels: list[_Level]) -> _Fit:
         """The fit of the largest evidence, its factor on the sigma of points `least` or more (MacKay 1992)."""
@@ -253,10 +254,3 @@ def _layouts(poses: Floats, pieces: Sequence[Ints]) -> list[_NodeLayout]:
         layouts.append(_NodeLayout(node, share, len(pieces), count))
         parts = max(1, 2 * parts)
     return layouts
-
-
-def _shifted(poses: Floats, shift: Floats) -> Floats:
-    """The poses (V, 4, 4) moved by a shift (3,)."""
-    out = poses.copy()
-    out[:, :3, 3] += shift
-    return out

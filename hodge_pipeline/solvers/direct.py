@@ -20,6 +20,7 @@ CG_STEPS_TRIED = 20
 STALE_STEPS = 8
 """CG steps with an old factor that cost about as much as a new one."""
 FRESH_STEPS = 50
+"""A guard: with the factor of its own Hessian a step of those graphs takes one, of one near by two."""
 TOLERANCE = 1e-6
 """Of a step: looser ones leave the soft modes of long chains wrong. A factor in double precision needs one step."""
 DAMPING = 1e-9

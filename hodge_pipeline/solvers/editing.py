@@ -24,6 +24,7 @@ from hodge_pipeline.solvers.setup import Setup, check_choice, held_rows, prepare
 from hodge_pipeline.types import Floats, Ints, Solution, ViewGraph
 
 LIMITS = Limits(max_iterations=100, relative_tolerance=1e-9)
+"""Those of `solve`, as edits are to give its poses."""
 
 SHARE = 10
 """Divides the number of free vertices: the most that a local solve moves."""

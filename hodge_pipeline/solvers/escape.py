@@ -45,7 +45,7 @@ class Escape:
 
 
 def escape(
-    setup: Setup, point: Point, answer: Certificate, limits: Limits, watch: Callable[[Point], None] | None = None
+    setup: Setup, point: Point, answer: Certificate, limits: Limits, watch: Callable[[Point], None] | None
 ) -> Escape:
     """What the staircase finds from a point whose certificate, `answer`, does not call it optimal."""
     problem, best, lowest = setup.problem, Escape(None, answer), point.cost

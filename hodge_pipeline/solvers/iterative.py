@@ -12,6 +12,7 @@ from hodge_pipeline.solvers.multigrid import Modes, Preconditioner, Precondition
 from hodge_pipeline.types import Floats
 
 MOST_STEPS = 300
+"""A guard: ten times what an old preconditioner is given."""
 STALE_STEPS = 30
 """About what a new preconditioner costs: an old one that needs more is made anew."""
 MOST_TURNED, SAMPLES = 0.05, 10_000

@@ -21,6 +21,7 @@ FAR_FROM_MINIMUM = "the first step wins less than it promises"
 CG_SHARE = 0.1
 """Of what further steps may still win: where so little is left in a linear system, it is solved."""
 LOOSEST_TOLERANCE, TIGHTEST_TOLERANCE = 0.05, 1e-3
+"""Relative residual of a linear system, at first and near the minimum, where steps become exact (Dembo et al. 1982)."""
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from hodge_pipeline.solvers.rotations import axial, cross, exponential, lever
 from hodge_pipeline.types import Floats
 
 MAX_CG_STEPS = 1000
+"""A guard: of 18 public graphs, 9 to 5750 poses, no step takes more than 24."""
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ class Fixes:
     covariances: Floats
     stated: Bools
     labels: Words
-    origin: str = ""
+    origin: str
 
     def __len__(self) -> int:
         return len(self.vertices)

@@ -41,7 +41,7 @@ def fingerprints(files: Sequence[Path], *, strict: bool = False) -> Fingerprints
     return {path: _fingerprint(path, strict) for path in files}
 
 
-def changed_since(before: Fingerprints, *, strict: bool = False) -> tuple[Note, ...]:
+def changed_since(before: Fingerprints, *, strict: bool) -> tuple[Note, ...]:
     """A note where files no longer have these fingerprints, so that results may mix two versions of them."""
     now = fingerprints(list(before), strict=strict)
     changed = [path.name for path in before if now[path] != before[path]]

@@ -76,9 +76,7 @@ def other_readout(found: Readout) -> Note:
     return Note("other readout", detail=f"{1e3 * found.best_s:.0f} ms")
 
 
-def landmarks_at_stamps(
-    frames: Sequence[Frame], clouds: CloudSet, twists: Floats, readout_s: float | None = None
-) -> Floats32:
+def landmarks_at_stamps(frames: Sequence[Frame], clouds: CloudSet, twists: Floats, readout_s: float | None) -> Floats32:
     """The landmarks (Q, 3) of the clouds of these frames (K), where they were at the stamps of their frames.
 
     `twists (K, 6)`: see `shutter.velocities`; `readout_s` takes the place of the cameras' own read-out.

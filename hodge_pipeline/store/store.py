@@ -194,37 +194,33 @@ def stored(folder: Path, function: Callable[..., T]) -> list[T]:
 
     Raises `WorkspaceError` where a file has changed since it was written.
     """
-    kind, found = get_type_hints(function)["return"], []
-    for path, files in _steps(folder, function.__name__):
-        try:
-            _check_files(path, files)
-            found.append(codec.load(path, kind))
-        except (OSError, ValueError) as error:
-            raise _damaged(path, error) from error
-    return found
+    kind = get_type_hints(function)["return"]
+    return [_checked(path, files, lambda path: codec.load(path, kind)) for path, files in _steps(folder, function)]
 
 
 def stored_clouds(folder: Path) -> list[CloudSet]:
     """The clouds that steps of the latest run made, in order, whichever step it was: see `stored`."""
-    found = []
-    for path, files in _steps(folder):
-        if f"{CLOUDS}/offsets.npy" in files:
-            try:
-                _check_files(path, files)
-                found.append(CloudSet.open(path / CLOUDS))
-            except (OSError, ValueError) as error:
-                raise _damaged(path, error) from error
-    return found
+    with_clouds = ((path, files) for path, files in _steps(folder) if f"{CLOUDS}/offsets.npy" in files)
+    return [_checked(path, files, lambda path: CloudSet.open(path / CLOUDS)) for path, files in with_clouds]
 
 
-def _steps(folder: Path, function: str = "") -> Iterator[tuple[Path, Mapping[str, list[Any]]]]:
+def _checked(path: Path, files: Mapping[str, list[Any]], load: Callable[[Path], T]) -> T:
+    """What a step's folder holds, if its files are as they were written."""
+    try:
+        _check_files(path, files)
+        return load(path)
+    except (OSError, ValueError) as error:
+        raise _damaged(path, error) from error
+
+
+def _steps(folder: Path, function: Callable[..., Any] | None = None) -> Iterator[tuple[Path, Mapping[str, list[Any]]]]:
     """Folder and files of each step of the latest run, or of this function's calls alone."""
     if not (folder / INDEX).exists():
         return
     path = folder / INDEX
     try:
         for entry in _unsealed(path)["steps"]:
-            if function in ("", entry["function"]):
+            if function is None or function.__name__ == entry["function"]:
                 path = folder / entry["name"]
                 yield path, _unsealed(path / RECORD)["files"]
     except (OSError, ValueError) as error:

@@ -25,7 +25,7 @@ def is_scanner(clouds: CloudSet, rows: Ints | None = None) -> bool:
     )
 
 
-def up_and_ahead(world_from_cam: Floats, is_scanner: bool = False) -> tuple[Floats, Floats]:
+def up_and_ahead(world_from_cam: Floats, is_scanner: bool) -> tuple[Floats, Floats]:
     """Unit vectors (3,): the mean up direction of cameras, or scanners, and their mean view direction across it."""
     axes = SCANNER_AXES if is_scanner else np.eye(3)
     _, down, ahead = axes @ world_from_cam[:, :3, :3].mean(axis=0).T

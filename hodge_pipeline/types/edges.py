@@ -232,22 +232,11 @@ class Edges:
 
     def with_registrations(self, found: Sequence[Registration]) -> Edges:
         """The table with a registration of each row; all count until acceptance rejects some."""
-
-        def column(name: str, shape: tuple[int, ...], kind: type) -> NDArray[Any]:
-            return np.array([getattr(one, name) for one in found], kind).reshape(-1, *shape)
-
-        return replace(
-            self,
-            i_from_j=column("i_from_j", (4, 4), float),
-            information=column("information", (6, 6), float),
-            fitness=column("fitness", (), float),
-            rmse_m=column("rmse_m", (), float),
-            correspondences=column("correspondences", (), np.int64),
-            iterations=column("iterations", (), np.int64),
-            converged=column("converged", (), np.bool_),
-            by_landmarks=column("by_landmarks", (), np.bool_),
-            status=np.full(len(found), USED),
-        )
+        columns: dict[str, Any] = {"status": np.full(len(found), USED)}
+        for name in (one.name for one in fields(Registration)):
+            old = getattr(self, name)
+            columns[name] = np.array([getattr(one, name) for one in found], old.dtype).reshape(-1, *old.shape[1:])
+        return replace(self, **columns)
 
     def put(self, rows: Ints | Bools | slice, **columns: Any) -> Edges:
         """The table with new values in some rows of these columns."""

@@ -97,7 +97,7 @@ class PositionFit:
     edge_factor: float
     fix_factor: float
     origin: str
-    problems: tuple[str, ...] = ()
+    problems: tuple[str, ...]
 
     @property
     def rejected(self) -> Bools:

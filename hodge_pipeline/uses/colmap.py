@@ -72,8 +72,8 @@ def run_refinement(
     out: Path | None,
     force: bool,
     overwrite: bool,
-    watcher: Watcher | None = None,
-    dask: str | None = None,
+    watcher: Watcher | None,
+    dask: str | None,
 ) -> RefinedColmap:
     """`refine_colmap` with bound options."""
     is_path = isinstance(model, (str, Path))

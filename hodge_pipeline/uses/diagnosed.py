@@ -19,7 +19,7 @@ from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.report.advice import advice, ranked
 from hodge_pipeline.report.diagnosis_page import sentence
 from hodge_pipeline.report.energy import EnergyRow, energy_rows
-from hodge_pipeline.report.suspicions import NOTHING_MOVED_M
+from hodge_pipeline.report.suspicions import moved_without
 from hodge_pipeline.rounds.suggestions import Suggestions, suggest_pairs
 from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.sources.frame_facts import listed
@@ -139,7 +139,7 @@ def _harmless(report: Report) -> str:
     """Why the wrong edges of a run do no harm; "" where they move poses, or the run did not measure that."""
     if report.wrong_edges is None or report.wrong_edges.matters(report.scale):
         return ""
-    moved = report.length(max(report.wrong_edges.moved_m, NOTHING_MOVED_M * report.scale))
+    moved = moved_without(report.wrong_edges, report)
     return f"Without the wrong edges no pose moves by more than {moved}: nothing to do."
 
 

@@ -42,11 +42,11 @@ def adjust(
     bodies: Bodies,
     priors: PositionPriors | None,
     *,
-    move_bodies: bool = True,
+    move_bodies: bool,
     refine: Refine = "none",
-    robust: bool = False,
+    robust: bool,
     roughly: bool = False,
-    near_optimum: bool = False,
+    near_optimum: bool,
 ) -> Adjustment:
     """Adjust it in place with COLMAP's own options; the points alone where bodies are not to move.
 

@@ -50,6 +50,7 @@ MAX_GAP_FRAMES = 1.0
 VIDEO_HZ = 30.0
 """Frames are rendered at this rate along a walked path."""
 SNIFFED_BYTES = 1 << 16
+"""Of a list: some hundred lines tell what it lists."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

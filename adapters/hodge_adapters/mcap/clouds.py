@@ -38,7 +38,7 @@ class CloudLayout:
     point_step: int
     row_step: int
     fields: tuple[tuple[str, str, int], ...]
-    cloud_from_points: tuple[float, ...] | None = None
+    cloud_from_points: tuple[float, ...] | None
 
 
 def ros_layout(message: Message, length: int) -> CloudLayout:

@@ -54,6 +54,7 @@ _RGB = {
 }
 
 _MAX_NIBBLES = 11
+"""Three bits each: 33, the fewest that hold a number of 32."""
 
 
 @dataclass(frozen=True)

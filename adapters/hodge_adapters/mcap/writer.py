@@ -24,6 +24,7 @@ TF, POINTS = ("/tf", "tf2_msgs/msg/TFMessage"), ("/points", "sensor_msgs/msg/Poi
 POINT_FIELDS = {"<u4": 6, "<f4": 7, "<f8": 8}
 """The codes of `sensor_msgs/PointField`."""
 LATEST_S = 2**31
+"""ROS counts seconds in 32 bits, with a sign."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

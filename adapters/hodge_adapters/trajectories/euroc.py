@@ -20,6 +20,7 @@ from hodge_pipeline.types.text import counted
 COLUMNS = 8
 NANO = 1_000_000_000
 MAX_STAMP_NS = 1 << 63
+"""Stamps are read as whole numbers of 64 bits."""
 HEADER = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []\n"
 
 

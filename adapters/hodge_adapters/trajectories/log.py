@@ -19,6 +19,7 @@ from hodge_pipeline.types import Floats, Ints, Source, Trajectory, ViewGraph
 from hodge_pipeline.types.text import counted
 
 MAX_NUMBER = 1 << 53
+"""Beyond it doubles skip whole numbers."""
 
 
 @plain_dataclass(frozen=True)

@@ -14,6 +14,7 @@ from hodge_pipeline.types import Source
 
 SNIFFED_LINES = 40
 SNIFFED_BYTES = 1 << 14
+"""The head of a file, where the lines of a format show themselves."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

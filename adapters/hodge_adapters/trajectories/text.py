@@ -61,7 +61,7 @@ class ParsedTrajectory:
     """A trajectory, and what had to be left out or put in order to read it, one line each."""
 
     trajectory: Trajectory
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...]
 
 
 def parse_tum(path: Path) -> ParsedTrajectory:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.components import connected_components
+from hodge_pipeline.complex.components import apart_along_x, connected_components
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import Diagnosis
@@ -28,6 +28,7 @@ FOLDED_SHARE = 0.005
 CERTAIN = 2.0
 """Times `MOST_VIOLATION`: a violation that no noise explains."""
 MOST_CUTS = 6
+"""Each costs a diagnosis and a second of looking; pairs that then still contradict each other are reported."""
 SURE = np.inf
 
 
@@ -143,12 +144,5 @@ def laid_apart(piece: Ints, piece_from: Floats, clouds: CloudSet) -> Floats:
     `piece (N,)`, `piece_from (N, 4, 4)`: the piece of each frame and its pose in it. Pieces lie so far apart that
     no cloud reaches another's.
     """
-    space = REACHES_APART * clouds.reach_m
-    out = np.array(piece_from, float)
-    begin_x = -np.inf
-    for number in range(int(piece.max(initial=-1)) + 1):
-        rows = np.flatnonzero(piece == number)
-        out[rows] = se3.inverse(piece_from[rows[0]]) @ piece_from[rows]
-        out[rows, 0, 3] += max(0.0, begin_x - float(out[rows, 0, 3].min()))
-        begin_x = float(out[rows, 0, 3].max()) + space
-    return out
+    first = np.unique(piece, return_index=True)[1]
+    return apart_along_x(se3.inverse(piece_from[first])[piece] @ piece_from, piece, REACHES_APART * clouds.reach_m)

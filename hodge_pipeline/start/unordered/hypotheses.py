@@ -175,7 +175,7 @@ def _allowed(shares: Floats, least: float) -> float:
     return max(USUAL_TIMES * float(np.quantile(known, 0.25)) if len(known) else 0.0, least)
 
 
-def violations(clouds: CloudSet, pairs: Ints, i_from_j: Floats, view_of: ViewOf, scale: float = 1.0) -> Floats:
+def violations(clouds: CloudSet, pairs: Ints, i_from_j: Floats, view_of: ViewOf, scale: float) -> Floats:
     """The free-space violation (P,) of each pair, NaN where a frame has no depth image."""
     points_of = lru_cache(maxsize=POINTS_KEPT)(partial(_sampled, clouds))
     out = np.full(len(pairs), np.nan)

@@ -71,10 +71,5 @@ class GlobalStart:
         default=DiagnosisOptions(order_prior=False),
         description="who judges the edges together; the order of the frames is no evidence here",
     )
-    similarity_voxel_m: float = Field(
-        default=0.05,
-        gt=0,
-        description="metres: scale of the features that scans are compared by, where the registrar has none",
-    )
     words: int = Field(default=32, ge=1, description="words of the global descriptors' vocabulary")
     seed: int = Field(default=0, ge=0, description="of the vocabulary's sample")

@@ -30,6 +30,10 @@ from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Ints,
 from hodge_pipeline.types.edges import REJECTED
 from hodge_pipeline.types.notes import Note, notes_of
 
+SIMILARITY_VOXEL_M = 0.05
+"""Metres in a room: the scale of the features by which scans are compared where the registrar has none, as that of
+`FpfhConsensus`."""
+
 
 @dataclass(frozen=True)
 class Start:
@@ -152,7 +156,7 @@ def propose(scene: Frames, clouds: CloudSet, rows: Ints, described: Path, option
         return all_pairs(rows)
     pairs = np.zeros((0, 2), np.int64)
     if options.similar_per_frame:
-        local = LocalDescriptors(described, clouds, options.similarity_voxel_m)
+        local = LocalDescriptors(described, clouds, SIMILARITY_VOXEL_M * options.limits.room_m)
         pairs = similar_pairs(local, rows, options, scene.given is not None)
     if scene.drift is None:
         return pairs
