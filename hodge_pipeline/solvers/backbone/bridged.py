@@ -56,31 +56,30 @@ def infer_bridged(
     broken where all loops are likelier with a bridge in its place: by more than chance would have them be. `is_sought`:
     whether breaks should be sought, by the loops judged without any.
     """
-    chain = joined(chain)
+    chain = unbroken = joined(chain)
     outliers = OutlierModel.of(chain)  # one for all trials, which makes their evidence comparable
-    found = None
-    for unbroken, learned in _with_and_without_bias(chain, outliers):
-        judge = partial(infer, outliers=outliers, trusted=trusted, may_thin=may_thin)
-        first = judge(unbroken, learned=learned)
-        found = None if first is None else _broken(unbroken, first, judge, outliers, trusted, most, is_sought)
-        if found is None or found[1].confirmed:
-            break
-    return found
-
-
-def _with_and_without_bias(chain: Chain, outliers: OutlierModel) -> Iterator[tuple[Chain, Iterator[Learned]]]:
-    """The chain without the bias of its steps where this makes loops likelier by more than chance would, and as it is;
-    with the scales of its errors.
-    """
+    judge = partial(infer, outliers=outliers, trusted=trusted, may_thin=may_thin)
     learned = learned_scales(chain, outliers)
-    first = next(learned)
-    unbiased = without_bias(chain, first.scales)
-    if unbiased is not None:
-        others = learned_scales(unbiased, outliers)
-        other = next(others)
-        if other.likelihood > first.likelihood + BY_CHANCE:
-            yield unbiased, iterate_over([other], others)
-    yield chain, iterate_over([first], learned)
+    stated = next(learned)
+    first = judge(chain, learned=iterate_over([stated], learned))
+    if first is None:
+        return None
+    found = _broken(chain, first, judge, outliers, trusted, most, is_sought)
+    unbiased = without_bias(chain, stated.scales)
+    if unbiased is None:
+        return found
+    learned = learned_scales(unbiased, outliers)
+    other = next(learned)
+    if other.likelihood <= stated.likelihood + BY_CHANCE:
+        return found
+    near = found[1] if found[1].confirmed and len(chain.ends) > JUDGED_TWICE else None
+    second = judge(unbiased, learned=[other] if near else iterate_over([other], learned), near=near)
+    if second is None:
+        return found
+    if not near:
+        unbiased, second = _broken(unbiased, second, judge, outliers, trusted, most, is_sought)
+    is_better = second.confirmed and (not found[1].confirmed or second.of_places > found[1].of_places + BY_CHANCE)
+    return (unbiased, second) if is_better else found
 
 
 def _broken(

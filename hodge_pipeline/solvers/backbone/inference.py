@@ -79,6 +79,7 @@ def infer(
     may_thin: bool,
     scales: Scales | None = None,
     learned: Iterable[Learned] | None = None,
+    near: Inferred | None = None,
 ) -> Inferred | None:
     """The loops of a chain, judged; those of `trusted (M,)` are used in any case.
 
@@ -91,7 +92,7 @@ def infer(
     priors = [(scales, EVEN)] if scales is not None else ((each.scales, each.shares) for each in learned)
     found: Inferred | None = None
     for prior in priors:
-        other = _Trial.of(chain, outliers, trusted, may_thin, *prior).found()
+        other = _Trial.of(chain, outliers, trusted, may_thin, *prior).found(near)
         if other is None:
             return None
         found = other if found is None or other.rank > found.rank else found
@@ -157,10 +158,15 @@ class _Trial:
         start = linearise(chain, chain.poses)
         return cls(start, judge(start, None, shares, outliers), shares, outliers, trusted, may_thin, scales)
 
-    def found(self) -> Inferred | None:
-        """What is `inferred`, or that nothing is used where nothing can be computed; None as in `infer`."""
+    def found(self, near: Inferred | None = None) -> Inferred | None:
+        """What is `inferred`, or settled from what is used and known `near` by, or that nothing is used where nothing
+        can be computed; None as in `infer`.
+        """
         try:
-            return self.inferred()
+            if near is None:
+                return self.inferred()
+            linear = replace(near.linear, chain=self.start.chain)
+            return self.settled(near.used, self.rated(near.used, linear, self.shares))
         except _TooManyLoops:
             return None
         except np.linalg.LinAlgError:  # loops tear paths so far apart that covariances are lost in rounding
