@@ -129,6 +129,18 @@ def test_a_plane_leaves_three_directions_without_information() -> None:
     assert (eigenvalues[:3] < 1e-6 * eigenvalues[3:].min()).all()
 
 
+def test_noise_of_normals_feigns_no_constraint_along_a_wall() -> None:
+    clouds = []
+    for seed in (1, 2):
+        rng = np.random.default_rng(seed)
+        wall = np.column_stack([rng.uniform(-1, 1, (4000, 2)), rng.normal(2.0, 0.003, 4000)]).astype(np.float32)
+        normals = np.array([0, 0, -1]) + rng.normal(0, 0.15, (4000, 3)) * [1, 1, 0]
+        normals /= np.linalg.norm(normals, axis=1)[:, None]
+        clouds.append(Gicp().prepare(PointCloud(wall, normals.astype(np.float32))))
+    along_x, along_y, across = np.diag(Gicp().register(clouds[0], clouds[1], np.eye(4)).information)[3:]
+    assert max(along_x, along_y) < 0.15**2 / 5 * across  # by the normals of one cloud alone it is 0.15**2 of it
+
+
 def test_information_is_the_second_derivative_of_the_point_to_plane_error() -> None:
     target, source = PreparedCloud(seen_from(WORLD_FROM_I, 1), 10), PreparedCloud(seen_from(WORLD_FROM_J, 2), 10)
 
@@ -145,8 +157,9 @@ def test_information_is_the_second_derivative_of_the_point_to_plane_error() -> N
     ]
     jacobian = np.stack(columns, axis=1)[near]
     variance = np.mean(errors(I_FROM_J, rows)[near] ** 2)
+    same = target.normals[rows] @ I_FROM_J[:3, :3]  # normals without noise: those of both clouds are the same
     found = assess(
-        target.find_nearest, target.points, target.normals, source.points, I_FROM_J,
+        target.find_nearest, target.points, target.normals, source.points, same, I_FROM_J,
         max_distance_m=0.1, points_per_sample=50.0,
     )  # fmt: skip
     expected = jacobian.T @ jacobian / (variance * 50.0)

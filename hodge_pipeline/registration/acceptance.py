@@ -35,12 +35,12 @@ class Acceptance:
         "null: any",
     )
     min_spread: float = Field(
-        default=0.02,
+        default=0.01,
         ge=0,
         le=0.3,
         description="share of a pair's information on translation that its weakest direction has, at most a third; "
         "below it what both see, such as a bare floor or wall, lets them slide on each other wherever the guess is "
-        "wrong. 0.02: normals within 8° of each other. Consecutive frames, and all below twice that, "
+        "wrong. 0.01: normals within 6° of each other. Consecutive frames, and all below twice that, "
         "stay at their guess in such a direction",
     )
     max_seen_through: float | None = Field(

@@ -44,6 +44,7 @@ def assess(
     target_points: Floats,
     target_normals: Floats,
     source_points: Floats,
+    source_normals: Floats,
     i_from_j: Floats,
     *,
     max_distance_m: float,
@@ -52,9 +53,10 @@ def assess(
     """Fitness, RMSE and information of `i_from_j`, from the points of j with a point of i within the distance.
 
     The information is that of the point-to-plane error e = n·(p − q) under `i_from_j exp(ξ)`, ξ = (rotation,
-    translation) in j's axes: Σ JᵀJ / (s² c), J = (p_j × n_j, n_j), with s the RMS of e over this pair (at least
-    1/50 of the distance). c = `points_per_sample` source points count as one independent measurement, since
-    neighbours share their error. Directions that the surfaces do not fix, as within a plane, get none.
+    translation) in j's axes: Σ JᵀK / (s² c), J = (p_j × n, n) by the normals of i and K by those of j, with s the RMS
+    of e over this pair (at least 1/50 of the distance). c = `points_per_sample` source points count as one independent
+    measurement, since neighbours share their error. Directions that the surfaces do not fix, as within a plane, get
+    none: the noise of a normal, which in JᵀJ would feign a constraint, is another one in K.
     """
     moved = se3.transform(i_from_j, source_points)
     if not np.isfinite(moved).all():
@@ -68,19 +70,29 @@ def assess(
     plane_errors = np.einsum("ij,ij->i", normals, moved[near] - target_points[rows[near]])
     least = MIN_SIGMA_SHARE * max_distance_m
     variance = max(float(np.mean(plane_errors**2)), least**2)
-    jacobian = plane_jacobian(normals, source_points[near], i_from_j)
+    jacobian = plane_jacobian(normals @ i_from_j[:3, :3], source_points[near])
+    again = plane_jacobian(source_normals[near], source_points[near])
+    again *= np.sign(np.einsum("ni,ni->n", jacobian[:, 3:], again[:, 3:]))[:, None]  # estimated ones have any sign
     return Assessment(
-        information=jacobian.T @ jacobian / (variance * points_per_sample),
+        information=_semidefinite(jacobian.T @ again) / (variance * points_per_sample),
         fitness=count / len(source_points),
         rmse_m=float(np.sqrt(squared[near].mean())),
         correspondences=count,
     )
 
 
-def plane_jacobian(normals_in_i: Floats, points_in_j: Floats, i_from_j: Floats) -> Floats:
-    """Rows (p_j × n_j, n_j) (N, 6): the derivative of n·(i_from_j exp(ξ) p) by ξ = (rotation, translation) at 0."""
-    normals_in_j = normals_in_i @ i_from_j[:3, :3]
+def plane_jacobian(normals_in_j: Floats, points_in_j: Floats) -> Floats:
+    """Rows (p × n, n) (N, 6): the derivative of n·(i_from_j exp(ξ) p) by ξ = (rotation, translation) at 0."""
     return np.hstack([np.cross(points_in_j, normals_in_j), normals_in_j])
+
+
+def _semidefinite(product: Floats) -> Floats:
+    """The nearest symmetric positive semidefinite matrix, rotation and translation each in their own unit."""
+    symmetric = (product + product.T) / 2
+    parts = np.repeat([np.trace(symmetric[:3, :3]), np.trace(symmetric[3:, 3:])], 3)
+    unit = np.sqrt(np.where(parts > 0, parts, 1.0))
+    values, vectors = np.linalg.eigh(symmetric / np.outer(unit, unit))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(unit, unit))
 
 
 def to_registration(assessment: Assessment, i_from_j: Floats, iterations: int, converged: bool) -> Registration:

@@ -95,9 +95,9 @@ class _SmallGicp:
                 return unregistered(guess)
             motion, converged = np.asarray(result.T_target_source), bool(result.converged)
             iterations += 1 + int(result.iterations)  # small_gicp counts from 0
-        points = source.sample_points(self.source_points[-1])
-        per_sample = self.points_per_sample * len(points) / len(source)
-        assessment = target.assess(points, motion, self.distances_m[-1], per_sample)
+        sample = source.sample_rows(self.source_points[-1])
+        per_sample = self.points_per_sample * len(sample) / len(source)
+        assessment = target.assess(source, sample, motion, self.distances_m[-1], per_sample)
         return to_registration(assessment, motion, iterations, converged)
 
 
@@ -209,8 +209,12 @@ class PreparedCloud:
 
     def sample_points(self, count: int) -> Floats:
         """The points (n, 3) of that sample."""
+        return self.points[self.sample_rows(count)]
+
+    def sample_rows(self, count: int) -> Ints:
+        """The rows (n,) of that sample."""
         stride = self._stride(count)
-        return self.points[self.seed % stride :: stride]
+        return np.arange(self.seed % stride, len(self), stride)
 
     def find_nearest(self, queries: Floats) -> tuple[Ints, Floats]:
         """Rows of the nearest points and the squared distances."""
@@ -218,11 +222,11 @@ class PreparedCloud:
         return np.asarray(rows).reshape(-1).astype(np.int64), np.asarray(squared).reshape(-1)
 
     def assess(
-        self, source_points: Floats, i_from_j: Floats, max_distance_m: float, points_per_sample: float
+        self, source: PreparedCloud, rows: Ints, i_from_j: Floats, max_distance_m: float, points_per_sample: float
     ) -> Assessment:
-        """What a registration of source points (n, 3) to this cloud is worth, see `assessment.assess`."""
+        """What a registration of these points (n,) of the source to this cloud is worth, see `assessment.assess`."""
         return assess(
-            self.find_nearest, self.points, self.normals, source_points, i_from_j,
+            self.find_nearest, self.points, self.normals, source.points[rows], source.normals[rows], i_from_j,
             max_distance_m=max_distance_m, points_per_sample=points_per_sample,
         )  # fmt: skip
 

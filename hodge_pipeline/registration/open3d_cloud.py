@@ -80,5 +80,5 @@ class Open3dRegistrar:
             if not se3.is_motion(result.transformation):
                 return unregistered(guess)
             motion = se3.from_parts(se3.project_to_so3(result.transformation[:3, :3]), result.transformation[:3, 3])
-        assessment = target.assess(source.points, motion, within_m, self.points_per_sample)
+        assessment = target.assess(source, np.arange(len(source)), motion, within_m, self.points_per_sample)
         return to_registration(assessment, motion, len(levels), converged=True)

@@ -148,7 +148,7 @@ class Rgbd:
         return mean if mean.fitness >= found.fitness - SAME_FITNESS else found
 
     def _within(self, target: PreparedFrame, source: PreparedFrame, i_from_j: Floats, distance_m: float) -> Assessment:
-        return target.assess(source.sample_points(ASSESSED_POINTS), i_from_j, distance_m, points_per_sample=1.0)
+        return target.assess(source, source.sample_rows(ASSESSED_POINTS), i_from_j, distance_m, 1.0)
 
     def _assessed(self, target: PreparedFrame, source: PreparedFrame, visual: VisualMotion) -> Registration:
         """The landmarks' motion with what the clouds say of it: a false one shows in the fitness."""

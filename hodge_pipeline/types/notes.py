@@ -105,7 +105,8 @@ LOOKS = {
     "landmarks fit worse: are the images turned, or played backwards?",
     "clock": "the clock goes back at {detail}: the step there counts as long as the usual one",
     "holes": "the recording stops for {detail}: what the frames on both sides share tells the motion there",
-    "path broken": "tracking was lost for good in {count} {count:place|places}: the path is in {detail} pieces",
+    "path broken": "tracking was lost for good in {count} {count:place|places}: the tracked path is in "
+    "{detail} pieces, which pairs registered later may join",
     "slid": "odometry slid unnoticed at {count} {count:frame|frames} ({detail}): the pairs over these steps agree on "
     "where they lead, and count in its place",
     "sweeps left out": "{count} {count:sweep is|sweeps are} left out, and posed by neighbours where these are known; "

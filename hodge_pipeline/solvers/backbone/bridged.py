@@ -56,7 +56,7 @@ def infer_bridged(
     broken where all loops are likelier with a bridge in its place: by more than chance would have them be. `is_sought`:
     whether breaks should be sought, by the loops judged without any.
     """
-    chain = unbroken = joined(chain)
+    chain = joined(chain)
     outliers = OutlierModel.of(chain)  # one for all trials, which makes their evidence comparable
     judge = partial(infer, outliers=outliers, trusted=trusted, may_thin=may_thin)
     learned = learned_scales(chain, outliers)
