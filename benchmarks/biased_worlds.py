@@ -1,7 +1,7 @@
 """Walks through streets, and flights above them, whose odometry turns too far at each step, as a biased gyroscope does.
 
-It turns about the vertical, or nearly so in flight: gravity tells the tilt. Its drift grows with the square of the path,
-while the information states independent errors.
+It turns about the vertical, or nearly so in flight: gravity tells the tilt. Its drift grows with the square of the
+path, while the information states independent errors.
 """
 
 from __future__ import annotations
