@@ -78,7 +78,8 @@ def infer_bridged(
         return found
     if not near:
         unbiased, second = _broken(unbiased, second, judge, outliers, trusted, most, is_sought)
-    is_better = second.confirmed and (not found[1].confirmed or second.of_places > found[1].of_places + BY_CHANCE)
+    least = found[1].of_places + BY_CHANCE * len(unbiased.bias)
+    is_better = second.confirmed and (not found[1].confirmed or second.of_places > least)
     return (unbiased, second) if is_better else found
 
 
