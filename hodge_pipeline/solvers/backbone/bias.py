@@ -25,6 +25,8 @@ UNSEEN = 0.1
 """Share of its steps below which a cycle does not tell the bias about an axis: others have turned it away."""
 LARGE = 4.0
 """Prior standard deviation of a bias in those of a step: cycles over like many steps are closed by whole turns more."""
+FINER = 0.5 ** np.arange(5)
+"""Factors on the errors of steps: learned without a bias, they are so large that they explain it."""
 MOST_TURNED = 4
 """Times that a path is turned: what cycles lack is linear in a bias that turns few of them by much."""
 
@@ -51,13 +53,15 @@ class _Cycles:
     """Rotations (K, r) that the cycles of loops lack, in the world's axes, and how a bias (r,) makes them.
 
     - `turned (K, r, r)`: the rotation that a unit bias makes; `steps (K,)`: how many it is of.
-    - `shared (K, K)`: the variance of each axis that two cycles share; `usual_rad`: standard deviation of a step.
+    - `shared (K, K)`: the variance of each axis by the steps that two cycles share; `own (K,)`: by the loop itself;
+      `usual_rad`: standard deviation of a step.
     """
 
     rotation: Floats
     turned: Floats
     steps: Ints
     shared: Floats
+    own: Floats
     usual_rad: float
 
     @classmethod
@@ -78,31 +82,45 @@ class _Cycles:
             np.einsum("kij,kj->ki", frame[high], lacks),
             along[high] - along[low],
             count[high] - count[low],
-            np.maximum(shared, 0.0) + np.diag(of_loop),
+            np.maximum(shared, 0.0),
+            of_loop,
             float(np.sqrt(np.median(of_step[measured]))),
         )
 
     def surely(self) -> Floats:
-        """The bias (r,), along the axes on which it is larger than chance would make it; zeros where on none.
-
-        It is that of the cycles that agree with the likeliest proposal, whose errors have the covariance `shared`.
+        """The bias (r,), along the axes on which errors of any of the scales `FINER` are likelier with it; zeros where
+        that may be chance. It is that of the cycles that agree with the likeliest proposal.
         """
-        size = self.rotation.shape[1]
         proposed = self._proposed()
         factor = self._factor(proposed)
         prior = -0.5 * ((proposed / (LARGE * self.usual_rad)) ** 2).sum(axis=1)
-        agree = np.flatnonzero(factor[np.argmax(prior + np.logaddexp(factor, 0.0).sum(axis=1))] > 0)
-        if not len(agree):
-            return np.zeros(size)
-        covariance = cho_factor(self.shared[np.ix_(agree, agree)])
-        near = proposed[np.argmax(prior + np.logaddexp(factor, 0.0).sum(axis=1))]
-        turned, left = self.turned[agree], self._left(near[None])[0, agree]
-        weighed = cho_solve(covariance, turned.reshape(len(agree), -1)).reshape(turned.shape)
-        information = np.einsum("kij,kil->jl", turned, weighed)
-        values, axes = np.linalg.eigh(information)
-        off = axes.T @ (near + np.linalg.lstsq(information, np.einsum("kij,ki->j", weighed, left), rcond=None)[0])
-        surely = 0.5 * values * off**2 > BY_CHANCE + np.log(len(proposed))
-        return np.asarray(axes @ np.where(surely, off, 0.0))
+        near = int(np.argmax(prior + np.logaddexp(factor, 0.0).sum(axis=1)))
+        agree = np.flatnonzero(factor[near] > 0)
+        found = [self._likely(agree, proposed[near], finer) for finer in FINER] if len(agree) else []
+        with_bias, bias = max(((both, bias) for _, both, bias in found), key=lambda each: each[0], default=(0.0, None))
+        without = max((none for none, *_ in found), default=0.0)
+        if bias is None or with_bias - without < BY_CHANCE + np.log(len(proposed)):
+            return np.zeros(self.rotation.shape[1])
+        return bias
+
+    def _likely(self, rows: Ints, near: Floats, finer: float) -> tuple[float, float, Floats]:
+        """The log-evidence of no bias and of the likelier one of each axis, near one (r,), by cycles (rows) whose steps
+        err by a factor; and the bias.
+        """
+        covariance = finer**2 * self.shared[np.ix_(rows, rows)] + np.diag(self.own[rows])
+        factor = cho_factor(covariance, lower=True)
+        turned, left = (
+            self.turned[rows],
+            self._left(near[None])[0, rows] + np.einsum("kij,j->ki", self.turned[rows], near),
+        )
+        weighed = cho_solve(factor, turned.reshape(len(rows), -1)).reshape(turned.shape)
+        values, axes = np.linalg.eigh(np.einsum("kij,kil->jl", turned, weighed))
+        pull = axes.T @ np.einsum("kij,ki->j", weighed, left)
+        spread = (LARGE * self.usual_rad) ** 2
+        gain = 0.5 * pull**2 * spread / (1 + spread * values) - 0.5 * np.log1p(spread * values)
+        none = -0.5 * (left * cho_solve(factor, left)).sum() - left.shape[1] * np.log(np.diag(factor[0])).sum()
+        bias = axes @ np.where(gain > 0, pull * spread / (1 + spread * values), 0.0)
+        return float(none), float(none + np.maximum(gain, 0.0).sum()), np.asarray(bias)
 
     def _proposed(self) -> Floats:
         """Biases (P, r), zero and those of one cycle each."""
@@ -121,7 +139,7 @@ class _Cycles:
 
     def _factor(self, bias: Floats) -> Floats:
         """Log Bayes factors (P, K) of the loops with each bias (P, r), against a rotation drawn at random."""
-        size, variance = bias.shape[1], np.diag(self.shared)
+        size, variance = bias.shape[1], np.diag(self.shared) + self.own
         chi2 = (self._left(bias) ** 2).sum(axis=-1) / variance
         at_random = np.log(2 * np.pi) if size == 1 else np.log(4 / 3 * np.pi**4)
         found = log_student(chi2, size) - 0.5 * size * np.log(variance) + at_random
