@@ -25,8 +25,8 @@ UNSEEN = 0.1
 """Share of its steps below which a cycle does not tell the bias about an axis: others have turned it away."""
 LARGE = 4.0
 """Prior standard deviation of a bias in those of a step: cycles over like many steps are closed by whole turns more."""
-FINER = 0.5 ** np.arange(5)
-"""Factors on the errors of steps: learned without a bias, they are so large that they explain it."""
+FACTORS = 2.0 ** np.arange(2, -5, -1)
+"""On the errors of steps: learned without a bias, they are so large that they explain it."""
 MOST_TURNED = 4
 """Times that a path is turned: what cycles lack is linear in a bias that turns few of them by much."""
 
@@ -88,26 +88,26 @@ class _Cycles:
         )
 
     def surely(self) -> Floats:
-        """The bias (r,), along the axes on which errors of any of the scales `FINER` are likelier with it; zeros where
-        that may be chance. It is that of the cycles that agree with the likeliest proposal.
+        """The bias (r,) of the cycles that agree with the likeliest proposal, along the axes on which they are likelier
+        with it, by errors of one of `FACTORS`; zeros where that may be chance.
         """
         proposed = self._proposed()
         factor = self._factor(proposed)
         prior = -0.5 * ((proposed / (LARGE * self.usual_rad)) ** 2).sum(axis=1)
         near = int(np.argmax(prior + np.logaddexp(factor, 0.0).sum(axis=1)))
         agree = np.flatnonzero(factor[near] > 0)
-        found = [self._likely(agree, proposed[near], finer) for finer in FINER] if len(agree) else []
+        found = [self._likely(agree, proposed[near], factor) for factor in FACTORS] if len(agree) else []
         with_bias, bias = max(((both, bias) for _, both, bias in found), key=lambda each: each[0], default=(0.0, None))
         without = max((none for none, *_ in found), default=0.0)
         if bias is None or with_bias - without < BY_CHANCE + np.log(len(proposed)):
             return np.zeros(self.rotation.shape[1])
         return bias
 
-    def _likely(self, rows: Ints, near: Floats, finer: float) -> tuple[float, float, Floats]:
+    def _likely(self, rows: Ints, near: Floats, times: float) -> tuple[float, float, Floats]:
         """The log-evidence of no bias and of the likelier one of each axis, near one (r,), by cycles (rows) whose steps
-        err by a factor; and the bias.
+        err `times` as much; and the bias.
         """
-        covariance = finer**2 * self.shared[np.ix_(rows, rows)] + np.diag(self.own[rows])
+        covariance = times**2 * self.shared[np.ix_(rows, rows)] + np.diag(self.own[rows])
         factor = cho_factor(covariance, lower=True)
         turned, left = (
             self.turned[rows],

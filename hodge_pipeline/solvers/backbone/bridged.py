@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain as iterate_over
 from itertools import compress
 
 import numpy as np
@@ -22,7 +21,7 @@ from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.places import MISTAKEN, MISTAKEN_PLACES, MOST_STEPS, agreeing_groups
-from hodge_pipeline.solvers.backbone.scales import Learned, Scales, learned_scales
+from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
 from hodge_pipeline.solvers.backbone.step_model import StepModel
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -59,46 +58,38 @@ def infer_bridged(
     chain = joined(chain)
     outliers = OutlierModel.of(chain)  # one for all trials, which makes their evidence comparable
     judge = partial(infer, outliers=outliers, trusted=trusted, may_thin=may_thin)
-    learned = learned_scales(chain, outliers)
-    stated = next(learned)
-    first = judge(chain, learned=iterate_over([stated], learned))
+
+    def judged(unbroken: Chain, first: Inferred) -> tuple[Chain, Inferred]:
+        return _bridged(unbroken, first, judge, outliers, trusted, most if most and is_sought(first) else 0)
+
+    first = judge(chain)
     if first is None:
         return None
-    found = _broken(chain, first, judge, outliers, trusted, most, is_sought)
-    unbiased = without_bias(chain, stated.scales)
-    if unbiased is None:
+    found = judged(chain, first)
+    unbiased = without_bias(chain, first.scales)
+    second = None if unbiased is None else judge(unbiased)
+    if unbiased is None or second is None:
         return found
-    learned = learned_scales(unbiased, outliers)
-    other = next(learned)
-    if other.likelihood <= stated.likelihood + BY_CHANCE:
-        return found
-    near = found[1] if found[1].confirmed and len(chain.ends) > JUDGED_TWICE else None
-    second = judge(unbiased, learned=[other] if near else iterate_over([other], learned), near=near)
-    if second is None:
-        return found
-    if not near:
-        unbiased, second = _broken(unbiased, second, judge, outliers, trusted, most, is_sought)
-    least = found[1].of_places + BY_CHANCE * len(unbiased.bias)
-    is_better = second.confirmed and (not found[1].confirmed or second.of_places > least)
-    return (unbiased, second) if is_better else found
+    other = judged(unbiased, second)
+    least = found[1].of_places + BY_CHANCE * len(unbiased.bias) if found[1].confirmed else -np.inf
+    return other if other[1].confirmed and other[1].of_places > least else found
 
 
-def _broken(
+def _bridged(
     unbroken: Chain,
     first: Inferred,
     judge: Callable[..., Inferred | None],
     outliers: OutlierModel,
     trusted: Bools,
     most: int,
-    is_sought: Callable[[Inferred], bool],
 ) -> tuple[Chain, Inferred]:
-    """The chain with broken steps bridged, and its loops judged, which without were `first`; see `infer_bridged`."""
+    """The chain with up to `most` broken steps bridged, and its loops judged; `first`: as they are without."""
     chain = unbroken
     as_stated = _as_stated(chain, first, judge)
     if as_stated is not None and _believed(as_stated, first):
         first, as_stated = as_stated, None
     found = first
-    for _ in range(most if most and is_sought(first) else 0):
+    for _ in range(most):
         better = _better(chain, found, as_stated, judge, outliers)
         if better is None:
             break
@@ -259,13 +250,12 @@ def joined(chain: Chain) -> Chain:
     than mistaken places have, or a single loop where hardly any is wrong. The evidence of two paths is kept while
     neither is joined to a third, and computed anew before joining ends.
     """
-    learned: Learned | None = None
-    evidence = dict[tuple[int, int], JoinEvidence]()
+    learned, evidence = None, dict[tuple[int, int], JoinEvidence]()
     while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
         poses = chain.poses
         outliers = OutlierModel.of(chain)
-        learned = learned or next(learned_scales(chain, outliers))
-        linear, rows = linearise(learned.scales.applied(chain), poses), np.arange(len(chain.ends))
+        scales, shares = learned = learned or next(learned_scales(chain, outliers))
+        linear, rows = linearise(scales.applied(chain), poses), np.arange(len(chain.ends))
         log_right, log_wrong = densities(linear, rows, outliers)
         pairwise, pairs = PairwiseConsistency.of(linear, log_wrong), chain.path[chain.ends]
         apart = pairs[:, 0] != pairs[:, 1]
@@ -276,7 +266,7 @@ def joined(chain: Chain) -> Chain:
         for both in two:
             if both not in evidence:
                 evidence[both] = JoinEvidence.of(pairwise, np.flatnonzero((pairs == both).all(axis=1)))
-        odds = float(np.log(learned.shares[0] / learned.shares[1]))
+        odds = float(np.log(shares[0] / shares[1]))
         scores = [evidence[both].best(mistaken, odds) for both in two]
         (score, loop), (low, high) = max(zip(scores, two, strict=True))
         if score > 0:

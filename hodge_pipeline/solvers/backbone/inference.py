@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,7 +19,7 @@ from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.mistakes import Mistake, mistakes
 from hodge_pipeline.solvers.backbone.places import MISTAKEN, MOST_STEPS, Places
 from hodge_pipeline.solvers.backbone.polish import polished
-from hodge_pipeline.solvers.backbone.scales import Learned, Scales, learned_scales
+from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
 from hodge_pipeline.types import Bools, Floats, Ints
 
 ROUNDS = 6
@@ -73,30 +73,23 @@ class Inferred:
 
 
 def infer(
-    chain: Chain,
-    outliers: OutlierModel,
-    trusted: Bools,
-    may_thin: bool,
-    scales: Scales | None = None,
-    learned: Iterable[Learned] | None = None,
-    near: Inferred | None = None,
+    chain: Chain, outliers: OutlierModel, trusted: Bools, may_thin: bool, scales: Scales | None = None
 ) -> Inferred | None:
     """The loops of a chain, judged; those of `trusted (M,)` are used in any case.
 
     `may_thin`: where the right loops leave more than `MOST_UNKNOWNS`, all are judged at the poses of some of them;
-    without it None comes back then. `scales`: of the errors; by default those `learned` from the loops by which their
+    without it None comes back then. `scales`: of the errors; by default those learned from the loops by which their
     places are likelier, and learned anew at the poses that they lead to where the drift of a long path had hidden how
     loops err: where scales there differ much, other loops agree by them, and the places are likelier.
     """
-    learned = learned_scales(chain, outliers) if learned is None else learned
-    priors = [(scales, EVEN)] if scales is not None else ((each.scales, each.shares) for each in learned)
+    learned = learned_scales(chain, outliers) if scales is None else [(scales, EVEN)]
     found: Inferred | None = None
-    for prior in priors:
-        other = _Trial.of(chain, outliers, trusted, may_thin, *prior).found(near)
+    for given in learned:
+        other = _Trial.of(chain, outliers, trusted, may_thin, *given).found()
         if other is None:
             return None
         found = other if found is None or other.rank > found.rank else found
-    for _ in range(MOST_ANEW if scales is None and not chain.bias.any() else 0):
+    for _ in range(MOST_ANEW if scales is None else 0):
         if found is None or not found.confirmed:
             break
         here = found.scales.at_solution(Fit(found.reduced, found.linear))
@@ -158,15 +151,10 @@ class _Trial:
         start = linearise(chain, chain.poses)
         return cls(start, judge(start, None, shares, outliers), shares, outliers, trusted, may_thin, scales)
 
-    def found(self, near: Inferred | None = None) -> Inferred | None:
-        """What is `inferred`, or settled from what is used and known `near` by, or that nothing is used where nothing
-        can be computed; None as in `infer`.
-        """
+    def found(self) -> Inferred | None:
+        """What is `inferred`, or that nothing is used where nothing can be computed; None as in `infer`."""
         try:
-            if near is None:
-                return self.inferred()
-            linear = replace(near.linear, chain=self.start.chain)
-            return self.settled(near.used, self.rated(near.used, linear, self.shares))
+            return self.inferred()
         except _TooManyLoops:
             return None
         except np.linalg.LinAlgError:  # loops tear paths so far apart that covariances are lost in rounding

@@ -132,20 +132,9 @@ class Scales:
         return step, loop
 
 
-@dataclass(frozen=True)
-class Learned:
-    """Scales of a chain's errors, the shares (2,) of right and wrong loops by them, and how many nats likelier than
-    chance they make the loops.
-    """
-
-    scales: Scales
-    shares: Floats
-    likelihood: float
-
-
-def learned_scales(chain: Chain, outliers: OutlierModel) -> Iterator[Learned]:
-    """The most probable scales given the loops' residuals against the bare chain; then those that a search from smaller
-    scales finds, where they differ much: the solutions have to tell.
+def learned_scales(chain: Chain, outliers: OutlierModel) -> Iterator[tuple[Scales, Floats]]:
+    """The most probable scales given the loops' residuals against the bare chain, and the shares (2,) of right and
+    wrong loops; then those that a search from smaller scales finds, where they differ much: the solutions have to tell.
 
     Loops count as independent: correlated errors of loops at one place, and of steps, would else pass for small errors.
     The log-likelihood of decoys, motions of loops between other places, is that of chance at each scale, and is
@@ -182,14 +171,14 @@ def learned_scales(chain: Chain, outliers: OutlierModel) -> Iterator[Learned]:
     other = max(others, key=lambda each: each[1], default=found)
     found = other if other[1] > found[1] + BY_CHANCE else found
 
-    def learned(logs: Floats, likelihood: float) -> Learned:
+    def learned(logs: Floats) -> tuple[Scales, Floats]:
         logs = np.minimum(logs, most)
-        return Learned(Scales(*map(float, np.exp(logs))), own.value(logs)[1], likelihood)
+        return Scales(*map(float, np.exp(logs))), own.value(logs)[1]
 
-    first = learned(*found)
+    first = learned(found[0])
     yield first
     start = max(SMALLER, key=lambda log: value(np.full(4, log), 0.0)) if chain.stated else 0.0
-    if start and (second := learned(*_likeliest(value, 0.0, start))).scales.differ_much(first.scales):
+    if start and (second := learned(_likeliest(value, 0.0, start)[0]))[0].differ_much(first[0]):
         yield second
 
 
