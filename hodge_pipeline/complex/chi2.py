@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import chdtri, fdtri
 
 from hodge_pipeline import se3
-from hodge_pipeline.types import Bools, Floats, ViewGraph
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 FREEDOM = 4.0
 """Degrees of freedom of Student's t, the tails of real registration errors: of nine graphs of fragments of rooms."""
@@ -39,7 +39,7 @@ def chi2_by_information(graph: ViewGraph, world_from_cam: Floats) -> Floats:
     return np.asarray(np.einsum("ea,eab,eb->e", xi, graph.information, xi))
 
 
-def tail_weight(chi2: Floats | float, axes: int, freedom: float = FREEDOM) -> Floats:
+def tail_weight(chi2: Floats | float, axes: int | Ints, freedom: float = FREEDOM) -> Floats:
     """The weight of Student's t for each χ² of `axes` dimensions: 1 at the expected χ², more below."""
     return np.asarray((freedom + axes) / (freedom + np.asarray(chi2)))
 
