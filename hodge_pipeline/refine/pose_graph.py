@@ -125,7 +125,8 @@ class SolvedFile:
             again = summary["edges"] - summary["edges_ignored"] - summary["poses"] + summary["pieces"]
             alone = "and priors" if self._has_priors else "alone"
             alone = f"and {again} that state the same steps again" if again > 0 else alone
-            others = f"nothing confirms the {summary['edges_ignored']} others (without --robust all count)"
+            others = "other edge" if summary["edges_ignored"] == 1 else f"{summary['edges_ignored']} others"
+            others = f"nothing confirms the {others} (without --robust all count)"
             where = f", {self.torn}" if self.torn else ""
             doubt = f", but {self.doubt}" if self.doubt else ""
             return f"Solved by consecutive edges {alone}{where}, since {others}{doubt}: {fell}"
