@@ -73,7 +73,10 @@ def solve_robust(
 
     priors, right = graph.priors, np.ones(0, bool)
     if priors is not None and len(priors.vertices):
-        kept = graph.select(found.kept) if isinstance(found, Diagnosis) else found.weighted(graph)
+        if isinstance(found, Backbone) and not found.chain.stated:
+            kept = found.weighted(graph)
+        else:
+            kept = graph.select(found.kept if isinstance(found, Diagnosis) else found.used)
         right = right_priors(kept, priors, with_priors)
         graph = replace(graph, priors=priors.select(right))
     final = (
