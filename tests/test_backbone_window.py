@@ -100,6 +100,22 @@ def test_a_window_is_judged_by_the_errors_that_it_shows_not_by_larger_ones_that_
     assert sorted(found.contradicted) == sorted([*steps, *off])
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_an_edge_that_errs_as_it_states_is_right_however_exact_the_others_are(dimension: int) -> None:
+    """Of 353 registered edges, 2.6 times as exact as they state, one off by a centimetre was called wrong."""
+    made, _ = with_window(drive(count=150, loops=0, wrong=0, dimension=dimension), 3)
+    graph = replace(made.graph, information=made.graph.information / 4.0**2)
+    row = np.flatnonzero(np.abs(np.diff(graph.edges, axis=1)[:, 0]) == 3)[70]
+    motions = graph.i_from_j.copy()
+    (shift,) = 2.7 / np.sqrt(graph.information[[row], 3, 3])
+    i, j = graph.edges[row]
+    motions[row] = se3.inverse(made.truth[i]) @ made.truth[j] @ se3.exp(np.array([0, 0, 0, shift, 0, 0]))
+    found = windowed(whole(replace(graph, i_from_j=motions)))
+    assert row in found.merged and not len(found.contradicted)
+    motions[row] = motions[row] @ se3.exp(np.array([0, 0, 0, shift, 0, 0]))
+    assert windowed(whole(replace(graph, i_from_j=motions))).contradicted.tolist() == [row]
+
+
 def test_a_break_under_all_of_the_window_is_found_by_the_loops() -> None:
     """A robot that is carried off: what passes over that step errs alike."""
     made, _ = with_window(drive(wrong=0.3, loops=80), 3)

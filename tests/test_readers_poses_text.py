@@ -124,6 +124,30 @@ def test_columns_that_hold_no_quaternion_are_refused(tmp_path: Path, row: str) -
         parse_tum(path)
 
 
+def test_two_paths_in_one_file_are_refused(tmp_path: Path) -> None:
+    """Every second pose was left out, and those of a refined file got the poses of the first session."""
+    path = tmp_path / "two.tum"
+    one = [f"{k / 10} {k / 10} 0 0 0 0 0 1" for k in range(30)]
+    other = [f"{k / 10} {k / 10} 5 0 0 0 0 1" for k in range(30)]
+    for rows in (one + other, [row for pair in zip(one, other, strict=True) for row in pair], one + other[:8]):
+        path.write_text("\n".join(rows))
+        with pytest.raises(
+            SourceError, match=r"two\.tum: \d+ poses have the stamp of an earlier one and lie elsewhere"
+        ):
+            parse_tum(path)
+    rounded = [f"{k // 4} {k / 10} 0 0 0 0 0 1" for k in range(30)]
+    still = [f"{k / 10} 1 2 3 0 0 0 1" for k in range(30)]
+    for rows, left in (
+        (one + one, 30),
+        (one + other[:2], 30),
+        (one[:3] + other[:1], 3),
+        (rounded, 8),
+        (still + still, 30),
+    ):
+        path.write_text("\n".join(rows))
+        assert len(parse_tum(path).trajectory) == left
+
+
 @pytest.mark.parametrize(
     "text", [f"0 {IDENTITY}", "stamp tx ty tz qx qy qz qw\n" + f"0 {IDENTITY}\n", f"1 {IDENTITY}\n2"]
 )

@@ -224,6 +224,10 @@ def test_loops_that_nothing_confirms_are_said_first(tmp_path: Path) -> None:
     write_g2o(tmp_path / "drive.g2o", made.graph, made.odometry())
     said = " ".join(hodge(tmp_path / "drive.g2o", "--robust").split())
     assert "verdict Solved by consecutive edges alone, since nothing confirms the 20 others" in said
+    one = made.graph.select(np.arange(made.graph.vertex_count))
+    write_g2o(tmp_path / "one.g2o", one, made.odometry())
+    said = " ".join(hodge(tmp_path / "one.g2o", "--robust").split())
+    assert "verdict Solved by consecutive edges alone, since nothing confirms the other edge" in said
 
 
 def test_pieces_that_edges_left_out_joined_are_said_first(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import chdtri, fdtri
 
 from hodge_pipeline import se3
-from hodge_pipeline.types import Bools, Floats, ViewGraph
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 FREEDOM = 4.0
 """Degrees of freedom of Student's t, the tails of real registration errors: of nine graphs of fragments of rooms."""
@@ -39,7 +39,7 @@ def chi2_by_information(graph: ViewGraph, world_from_cam: Floats) -> Floats:
     return np.asarray(np.einsum("ea,eab,eb->e", xi, graph.information, xi))
 
 
-def tail_weight(chi2: Floats | float, axes: int, freedom: float = FREEDOM) -> Floats:
+def tail_weight(chi2: Floats | float, axes: int | Ints, freedom: float = FREEDOM) -> Floats:
     """The weight of Student's t for each χ² of `axes` dimensions: 1 at the expected χ², more below."""
     return np.asarray((freedom + axes) / (freedom + np.asarray(chi2)))
 
@@ -53,16 +53,16 @@ STUDENT_99 = {axes: tail_gate(axes, 0.01) for axes in (1, 2, 3, 6)}
 """The χ² gate of an edge, by its number of axes: the 99 % quantile under Student's t."""
 
 
-def student_weight(chi2: Floats, axes: int, *, usual: Floats, registered: bool) -> Floats:
+def student_weight(chi2: Floats, axes: int, *, usual: Floats, registered: bool, needed: Bools | bool = False) -> Floats:
     """The weight (E,) of each χ² in a robust solve: that of Student's t, 1 up to the expected χ² and 0 beyond its 99 %
     quantile. The median of `usual (N,)` gives the χ² their scale. Edges that are `registered` and kept have lighter
-    tails, and none weighs 0.
+    tails, and none weighs 0; nor does one that is `needed (E,)` to hold its ends together.
     """
     voting = usual[usual > EXACT * usual.max(initial=0.0)]
     scale = float(np.median(voting)) / MEDIAN_CHI2[axes] if len(voting) else 1.0
     scaled = chi2 / max(scale, np.finfo(float).tiny)
     freedom, gate = (REGISTERED_FREEDOM, np.inf) if registered else (FREEDOM, STUDENT_99[axes])
-    return np.where(scaled <= gate, np.minimum(tail_weight(scaled, axes, freedom), 1.0), 0.0)
+    return np.where(needed | (scaled <= gate), np.minimum(tail_weight(scaled, axes, freedom), 1.0), 0.0)
 
 
 def squares_at_both_ends(i_from_j: Floats, xi: Floats) -> tuple[Floats, Floats]:

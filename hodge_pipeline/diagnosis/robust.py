@@ -20,6 +20,7 @@ from hodge_pipeline.diagnosis.cycles import is_folded
 from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, backbone_or_diagnosis
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG, Diagnosis
+from hodge_pipeline.diagnosis.robust_priors import excess_of_priors, left_out_note, right_priors
 from hodge_pipeline.solvers.backbone.trust import Backbone
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.reweighted import reweighted
@@ -48,7 +49,8 @@ def solve_robust(
     residuals of the kept edges, the poses are their maximum-likelihood ones; else kept edges have weights by Student's
     t, 0 beyond the gate of `student_weight`. The graph's fixed vertices stay at their start. Components are those of
     the kept edges. `confirmed` is False where edges are left out, or disagree by more than they state, and the cycles
-    of the others close no better than by chance; and where consecutive edges are folded.
+    of the others close no better than by chance; and where consecutive edges are folded. Priors that contradict the
+    kept edges and most other priors are left out, and a note counts them.
     """
     check_choice("objective", objective, ObjectiveName)
     start = None if start is None else np.asarray(start, float)
@@ -56,7 +58,7 @@ def solve_robust(
     found = backbone_or_diagnosis(graph, diagnosis)
     fixed, unheld = held_rows(graph, start)
 
-    def solved(chosen: ViewGraph, poses: Floats) -> Solution:
+    def solved(chosen: ViewGraph, poses: Floats, certificate: bool = certificate) -> Solution:
         return solve(
             chosen,
             start=start if len(fixed) else _placed(chosen, poses, start),
@@ -66,11 +68,26 @@ def solve_robust(
             certificate=certificate,
         )
 
+    def with_priors(chosen: ViewGraph) -> Floats:
+        return solved(chosen, found.world_from_cam, certificate=False).world_from_cam
+
+    priors, right = graph.priors, np.ones(0, bool)
+    if priors is not None and len(priors.vertices):
+        if isinstance(found, Backbone) and not found.chain.stated:
+            kept = found.weighted(graph)
+        else:
+            kept = graph.select(found.kept if isinstance(found, Diagnosis) else found.used)
+        right = right_priors(kept, priors, with_priors)
+        graph = replace(graph, priors=priors.select(right))
     final = (
         _without_backbone(graph, found, solved) if isinstance(found, Diagnosis) else _on_backbone(graph, found, solved)
     )
     metrics = {**final.metrics, "kept_edges": float((final.weights > 0).sum())}
-    return replace(final, notes=(*unheld, *final.notes), metrics=metrics)
+    notes = (*unheld, *final.notes)
+    if priors is not None and graph.priors is not None and len(right):
+        metrics["priors_excess"] = excess_of_priors(graph, graph.priors, final.world_from_cam)
+        notes = notes if right.all() else (left_out_note(graph, priors, right, final.world_from_cam), *notes)
+    return replace(final, notes=notes, metrics=metrics)
 
 
 def _on_backbone(graph: ViewGraph, backbone: Backbone, solved: Solver) -> Solution:

@@ -90,8 +90,14 @@ class SolvedFile:
             return "NOT proven to be the global minimum"
         if solution.converged is False:
             return "stopped before it converged"
-        excess = self.excess
-        return f"edges are off by {excess:.2g} times what they state" if excess > MOST_EXCESS else ""
+        if (excess := solution.metrics.get("priors_excess", 0.0)) > MOST_EXCESS:
+            return f"priors are off by {excess:.2g} times what they state"
+        what = "edges and priors" if self._has_priors else "edges"
+        return f"{what} are off by {excess:.2g} times what they state" if (excess := self.excess) > MOST_EXCESS else ""
+
+    @property
+    def _has_priors(self) -> bool:
+        return self.graph.priors is not None and len(self.graph.priors.vertices) > 0
 
     @property
     def excess(self) -> float:
@@ -117,10 +123,13 @@ class SolvedFile:
             return "Nothing to solve: no edge joins two vertices with information, so every pose is as it was"
         if self.choices.robust and self.solution.confirmed is None and "tested_edges" in self.solution.metrics:
             again = summary["edges"] - summary["edges_ignored"] - summary["poses"] + summary["pieces"]
-            alone = f"and {again} that state the same steps again" if again > 0 else "alone"
-            others = f"nothing confirms the {summary['edges_ignored']} others (without --robust all count)"
+            alone = "and priors" if self._has_priors else "alone"
+            alone = f"and {again} that state the same steps again" if again > 0 else alone
+            others = "other edge" if summary["edges_ignored"] == 1 else f"{summary['edges_ignored']} others"
+            others = f"nothing confirms the {others} (without --robust all count)"
             where = f", {self.torn}" if self.torn else ""
-            return f"Solved by consecutive edges {alone}{where}, since {others}: {fell}"
+            doubt = f", but {self.doubt}" if self.doubt else ""
+            return f"Solved by consecutive edges {alone}{where}, since {others}{doubt}: {fell}"
         proven = ", globally optimal" if summary["certified"] and not self.doubt else ""
         doubts = " and ".join(filter(None, (self.doubt, self.torn)))
         return f"Solved{proven}, but {doubts}: {fell}" if doubts else f"Solved{proven}: {fell}"

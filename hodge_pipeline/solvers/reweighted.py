@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from hodge_pipeline.complex.chi2 import chi2_by_information, student_weight
+from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.solvers.weights import dimension_of
 from hodge_pipeline.types import Floats, Solution, ViewGraph
 
@@ -25,13 +26,17 @@ def reweighted(
 ) -> tuple[Floats, Solution]:
     """The weights (E,), at most those given, and the solution that they lead to; `solution` is that of the given ones.
 
-    `solved` gives the solution of weights (E,) from poses (V, 4, 4); `registered`: see `student_weight`.
+    `solved` gives the solution of weights (E,) from poses (V, 4, 4); `registered`: see `student_weight`. An edge in no
+    cycle, which priors alone contradict, keeps a weight: without it they would leave a part of the graph free to turn.
     """
     used, axes = weights > 0, 3 if dimension_of(graph) == 2 else 6
+    needed = np.zeros_like(used)
+    if graph.priors is not None:
+        needed[used] = series_classes(graph.edges[used], graph.vertex_count) < 0
     for _ in range(ROUNDS):
         chi2 = np.maximum(chi2_by_information(graph, solution.world_from_cam), 0.0)
         usual = chi2[used & (chi2 > _chi2_of_rounding(graph, solution.world_from_cam))]
-        new = np.where(used, student_weight(chi2, axes, usual=usual, registered=registered), 0.0)
+        new = np.where(used, student_weight(chi2, axes, usual=usual, registered=registered, needed=needed), 0.0)
         if np.abs(new - weights).max(initial=0.0) < SETTLED:
             break
         weights, solution = new, solved(new, solution.world_from_cam)

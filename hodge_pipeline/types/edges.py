@@ -31,6 +31,10 @@ class Priors:
     world_from_vertex: Floats
     information: Floats
 
+    def select(self, rows: Ints | Bools) -> Priors:
+        """These priors only, in this order."""
+        return Priors(self.vertices[rows], self.world_from_vertex[rows], self.information[rows])
+
 
 @dataclass(frozen=True)
 class Registration:

@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 
 from hodge_adapters.posed import trajectory_of, written
 from hodge_adapters.text_rows import Row, first_text, listed, read_text, to_floats, write_text_atomically
-from hodge_adapters.trajectories.text import first_of_quaternion, ordered, refuse_other_columns
+from hodge_adapters.trajectories.text import first_of_quaternion, ordered, refuse_other_columns, refuse_two_paths
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.stages import Sniff
@@ -51,6 +51,7 @@ class EurocReader:
             raise SourceError(f"{path}: no line of `nanoseconds, x, y, z, qw, qx, qy, qz, …`: is it a EuRoC file?")
         table = np.array(good)
         refuse_other_columns(table, path)
+        refuse_two_paths(table, path)
         parsed = ordered(table)
         notes = ["poses are those of the body in the file (EuRoC's ground truth: the IMU), not of a camera"]
         notes += parsed.notes

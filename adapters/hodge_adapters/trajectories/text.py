@@ -27,6 +27,11 @@ _QUATERNION = re.compile(r"\bq_?(?:RS_)?([wx])\b", re.IGNORECASE)
 NO_QUATERNION = 0.1
 """So far from 1 is the length of none that is written with one decimal or more."""
 
+ELSEWHERE, TWO_PATHS, FEW = 3.0, 0.1, 2
+"""Times the length that nine in ten steps stay below, from which a pose of a repeated stamp is another's, as rounded
+stamps repeat within a step or two; and the share and the number of such poses up to which it is a path with mistakes.
+"""
+
 UNITS = (("nanoseconds", 1e17, 1e9), ("microseconds", 1e14, 1e6), ("milliseconds", 1e11, 1e3))
 """What all stamps from so much on count, and how many make a second: as seconds 1e11 is the year 5138."""
 
@@ -78,6 +83,7 @@ def parse_tum(path: Path) -> ParsedTrajectory:
     if w_first:
         table[:, 4:] = np.roll(table[:, 4:], -1, axis=1)
     refuse_other_columns(table, path)
+    refuse_two_paths(table, path)
     parsed = ordered(table)
     notes += [f"{path.name}: {note}" for note in parsed.notes]
     if w_first:
@@ -187,6 +193,20 @@ def refuse_other_columns(table: Floats, path: Path) -> None:
         raise SourceError(
             f"{path}: no quaternion has a length near 1, the first {lengths[0]:.4g}: other columns, such as an index "
             "before the stamp, stand in its place: remove them"
+        )
+
+
+def refuse_two_paths(table: Floats, path: Path) -> None:
+    """Raise `SourceError` where many rows (N, 8) repeat a stamp, yet lie elsewhere than its first pose."""
+    _, first, again = np.unique(table[:, 0], return_index=True, return_inverse=True)
+    places = table[:, 1:4]
+    steps = np.linalg.norm(np.diff(places[first], axis=0), axis=1)
+    usual = float(np.quantile(steps, 0.9)) if len(steps) else 0.0
+    elsewhere = np.linalg.norm(places - places[first][again], axis=1) > ELSEWHERE * usual
+    if (count := int(elsewhere.sum())) > max(TWO_PATHS * len(table), FEW):
+        raise SourceError(
+            f"{path}: {count} poses have the stamp of an earlier one and lie elsewhere: two sessions or two cameras? "
+            "Give each in a file of its own"
         )
 
 

@@ -117,7 +117,8 @@ def _agreeing(chain: Chain, near: Ints) -> tuple[Floats, Floats]:
     solve with Student's t.
 
     It starts without loops that disagree with the chain over steps which other loops confirm, and without steps that
-    two loops or more contradict and none confirms.
+    two loops or more contradict and none confirms. An edge that errs no more than it states, and closes as right cycles
+    do, agrees however exact the others are.
     """
     linear, ends, size = linearise(chain, chain.poses), chain.ends[near], len(chain.axes)
     chi2 = mahalanobis(linear.loops[0][near], by_path(linear, near))[0]
@@ -156,7 +157,10 @@ def _agreeing(chain: Chain, near: Ints) -> tuple[Floats, Floats]:
         if np.abs(weights - before).max() < SETTLED:
             break
         poses = solved(weights, poses)
-    return np.where(chi2 <= STUDENT_99[size], weights, 0.0), poses
+    i, j = graph.edges.T
+    near_enough = closes(graph.i_from_j, se3.inverse(poses[i]) @ poses[j], gate(chain), np.sqrt(np.abs(j - i)))
+    agree = (chi2 <= STUDENT_99[size]) | chain.stated & near_enough & (chi2 * scale < AS_STATED * size)
+    return np.where(agree, weights, 0.0), poses
 
 
 def _rounding(chain: Chain, near: Ints) -> float:
