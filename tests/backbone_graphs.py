@@ -250,41 +250,6 @@ def two_laps(seed: int, *, wrong: float = 0.2, bias: float = 0.001, lap: int = 3
     return Drive(ViewGraph.from_edges(np.arange(count), edges, motions, information), truth, right)
 
 
-def blocks(seed: int, count: int = 300, loops: int = 40, wrong: int = 300) -> Drive:
-    """A walk along streets at right angles, 12 blocks of a metre wide, with right loops on its first half and wrong
-    ones that all say the very same place.
-    """
-    rng = np.random.default_rng(seed)
-    ways, places, turns = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]]), [np.zeros(2, int)], [0]
-    while len(places) < count:
-        turn = (turns[-1] + rng.choice([0, 0, 0, 1, 3])) % 4
-        ahead = places[-1] + ways[turn]
-        turns, places = (
-            ([*turns, turn], [*places, ahead]) if (np.abs(ahead) <= 6).all() else ([*turns[:-1], turn], places)
-        )
-    place = np.array(places)
-    yaw = np.outer(np.array(turns) * np.pi / 2, [0.0, 0.0, 1.0])
-    truth = se3.from_parts(se3.so3_exp(yaw), np.column_stack([place, np.zeros(count)]).astype(float))
-    low, high = np.triu_indices(count // 2, 20)
-    near = np.flatnonzero(np.abs(place[low] - place[high]).sum(axis=1) <= 1)
-    near = rng.choice(near, loops, replace=False)
-    steps = np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
-    right = np.concatenate([steps, np.stack([low, high], axis=1)[near]])
-    size = np.array([0, 0, 0.002, 0.01, 0.01, 0])
-    motion = se3.inverse(truth[right[:, 0]]) @ truth[right[:, 1]]
-    motion = motion @ se3.exp(rng.normal(size=(len(right), 6)) * size)
-    ends = np.sort(rng.integers(0, count, (wrong, 2)), axis=1)
-    ends = ends[np.diff(ends, axis=1)[:, 0] > 10]
-    graph = ViewGraph.from_edges(
-        np.arange(count),
-        np.concatenate([right, ends]),
-        np.concatenate([motion, np.tile(np.eye(4), (len(ends), 1, 1))]),
-        np.tile(np.diag(1 / np.repeat([0.002, 0.01], 3) ** 2), (len(right) + len(ends), 1, 1)),
-        dimension=2,
-    )
-    return Drive(graph, np.asarray(truth), np.arange(graph.edge_count) < len(right))
-
-
 def field(seed: int) -> Drive:
     """A field that is mown in eight rows, two metres apart, with 70 loops between near rows and 30 that take a row for
     the next one.

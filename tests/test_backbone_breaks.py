@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from backbone_graphs import WORLDS, blocks, broken, drive, spanned
+from backbone_graphs import WORLDS, broken, drive, spanned
 from benchmarks.spoilt_graphs import simulated_cases
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
@@ -114,11 +114,3 @@ def test_no_right_step_is_called_wrong(wrong: float) -> None:
         made = drive(seed=seed, world=WORLDS[seed], wrong=wrong, in_groups=bool(seed % 2), count=200, loops=60)
         backbone = find_backbone(made.graph)
         assert backbone is None or backbone.used[:199].all()
-
-
-def test_a_few_of_many_loops_that_agree_by_chance_break_no_step() -> None:
-    """Along streets at right angles, where all wrong loops say the very same place: 3.9 m for .07."""
-    made = blocks(4)
-    backbone = find_backbone(made.graph)
-    assert backbone is not None
-    assert backbone.used[backbone.steps].all()

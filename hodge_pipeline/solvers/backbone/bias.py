@@ -13,7 +13,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, LARGEST, log_student
-from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
+from hodge_pipeline.solvers.backbone.loop_places import corridors, one_of_each_place
 from hodge_pipeline.solvers.backbone.scales import Scales
 from hodge_pipeline.types import Floats, Ints
 
@@ -38,6 +38,7 @@ def without_bias(chain: Chain, scales: Scales) -> Chain | None:
     if not len(rows):
         return None
     rows = rows[one_of_each_place(scaled.places[rows])]
+    rows = rows[np.unique(corridors(scaled.places[rows]), return_index=True)[1]]  # a mistaken one proposes any bias
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_CYCLES)).astype(np.int64)]
     scaled = scaled.with_loops(rows, chain.ends[rows])
     for _ in range(MOST_TURNED):
@@ -94,14 +95,14 @@ class _Cycles:
         proposed = self._proposed()
         factor = self._factor(proposed)
         prior = -0.5 * ((proposed / (LARGE * self.usual_rad)) ** 2).sum(axis=1)
-        near = int(np.argmax(prior + np.logaddexp(factor, 0.0).sum(axis=1)))
-        agree = np.flatnonzero(factor[near] > 0)
-        found = [self._likely(agree, proposed[near], factor) for factor in FACTORS] if len(agree) else []
-        with_bias, bias = max(((both, bias) for _, both, bias in found), key=lambda each: each[0], default=(0.0, None))
-        without = max((none for none, *_ in found), default=0.0)
-        if bias is None or with_bias - without < BY_CHANCE + np.log(len(proposed)):
+        gains = np.logaddexp(factor, 0.0)
+        near = int(np.argmax(prior + gains.sum(axis=1)))
+        agree, surely = np.flatnonzero(factor[near] > 0), BY_CHANCE + np.log(len(proposed))
+        if gains[near].sum() - gains[near].max() < surely:  # a single cycle agrees with its own proposal
             return np.zeros(self.rotation.shape[1])
-        return bias
+        found = [self._likely(agree, proposed[near], times) for times in FACTORS]
+        _, likeliest, bias = max(found, key=lambda each: each[1])
+        return bias if likeliest > max(none for none, *_ in found) + surely else np.zeros(len(bias))
 
     def _likely(self, rows: Ints, near: Floats, times: float) -> tuple[float, float, Floats]:
         """The log-evidence of no bias and of the likelier one of each axis, near one (r,), by cycles (rows) whose steps

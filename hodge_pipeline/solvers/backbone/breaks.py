@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,7 +29,6 @@ class Break:
 
     - `motion (4, 4)` and `covariance (p, p)`: of the bridge in its place; `usual`: whether it is as steps usually are.
     - `log_evidence`: in nats, for the break.
-    - `agreeing (K,)`: the loops that agree on it, which the chain does not explain; none where steps alone show it.
     """
 
     at: int
@@ -37,7 +36,6 @@ class Break:
     covariance: Floats
     log_evidence: float
     usual: bool = True
-    agreeing: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 def agreed_breaks(pairwise: PairwiseConsistency, usual: StepModel) -> list[Break]:
@@ -60,8 +58,7 @@ def agreed_breaks(pairwise: PairwiseConsistency, usual: StepModel) -> list[Break
             broken = _far_break(pairwise, seed, at[far], score[far])
             if chain.corridors_over(broken.at, rows[(factor > 0) & (gain > 0)]) > 1:  # else no trial will show as many
                 found.append(broken)
-        agreeing = rows[(factor > 0) & ~pairwise.used[rows]]
-        out += [replace(each, agreeing=agreeing[chain.passes(each.at, agreeing)]) for each in found]
+        out += found
     return sorted(out, key=lambda each: -each.log_evidence)
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import compress
 
 import numpy as np
 
@@ -23,22 +22,22 @@ from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.places import MISTAKEN, MISTAKEN_PLACES, MOST_STEPS, agreeing_groups
 from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
 from hodge_pipeline.solvers.backbone.step_model import StepModel
-from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types import Bools, Ints
 
 MOST_BREAKS, TRIED_AT_ONCE = 10, 2
 """Breaks that are bridged one after the other, and that are tried each time."""
 CONTRADICTED = 1 / 3
-"""Share of the loops at the places of used ones that must be used, and of the places of loops over a step that must
-agree on its break: with fewer, these are compared with motions, or ends, drawn at random, which takes three times as
-long as all else. In parts of four graphs of the literature by chance .08 to .35 agree, but for one of .5; of right ones
-.47 to .64 where 60 % of the motions are wrong, .21 to .35 where 90 % are; of RobotCar's .39, .48.
+"""Share of the loops at the places of used ones that must be used: with fewer, these are compared with motions drawn at
+random, which takes three times as long as all else. In parts of four graphs of the literature by chance .08 to .35
+agree, but for one of .5; of right ones .47 to .64 where 60 % of the motions are wrong, .21 to .35 where 90 % are; of
+RobotCar's .39, .48.
 """
 JUDGED_TWICE = 1000
 """Most loops that are judged by stated errors too where learned ones are only a few times as large: a limit on cost.
 RobotCar's 2438 took 1.1 CPU s more, of 1.5.
 """
 DRAWN = 3
-"""Times that the motions, or the ends, of loops are drawn at random."""
+"""Times that the motions of loops are drawn at random."""
 
 
 def infer_bridged(
@@ -177,12 +176,6 @@ def _candidates(chain: Chain, found: Inferred, outliers: OutlierModel) -> list[t
     usual, least = StepModel.of(chain), by_chance(len(factor))
     fold = np.log(max((1 / loops_at_place(pairwise.chain.places)).sum(), 1))  # for the best of as many places
     agreed = [each for each in agreed_breaks(pairwise, usual) if each.log_evidence > BY_CHANCE + fold]
-    doubtful = [_few_agree(pairwise, each) for each in agreed]
-    if any(doubtful):
-        agreeing = np.zeros(len(factor), bool)
-        agreeing[np.concatenate([each.agreeing for each in compress(agreed, doubtful)])] = True
-        chance = list(_breaks_by_chance(pairwise, agreeing, usual, shares, outliers))
-        agreed = [each for each, doubt in zip(agreed, doubtful, strict=True) if not doubt or _is_likelier(each, chance)]
     far, agreed = [each for each in agreed if not each.usual], [each for each in agreed if each.usual]
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
     candidates = [(each, least) for each in agreed[:TRIED_AT_ONCE] if each is agreed[0] or each.at != agreed[0].at]
@@ -194,46 +187,6 @@ def _candidates(chain: Chain, found: Inferred, outliers: OutlierModel) -> list[t
             candidates.append((of_run, BY_CHANCE - of_run.log_evidence))
     candidates += [(each, max(least - each.log_evidence, BY_CHANCE)) for each in unlike]
     return candidates + [(each, least) for each in far[:1]]
-
-
-def _few_agree(pairwise: PairwiseConsistency, broken: Break) -> bool:
-    """Whether fewer than `CONTRADICTED` of the places of loops over a step that the chain does not explain agree on its
-    break.
-    """
-    chain, rows = pairwise.chain, np.flatnonzero(~pairwise.used)
-    over = rows[chain.passes(broken.at, rows)]
-    agreed, every = (float((1 / loops_at_place(chain.places[each])).sum()) for each in (broken.agreeing, over))
-    return agreed < CONTRADICTED * every
-
-
-def _is_likelier(broken: Break, chance: list[Break]) -> bool:
-    """Whether a break is likelier than all of its kind that are due to chance."""
-    others = (each.log_evidence for each in chance if each.usual == broken.usual)
-    return broken.log_evidence > max(others, default=-np.inf) + BY_CHANCE
-
-
-def _breaks_by_chance(
-    pairwise: PairwiseConsistency, agreeing: Bools, usual: StepModel, shares: Floats, outliers: OutlierModel
-) -> Iterator[Break]:
-    """The breaks where loops that the chain does not explain end at each other's upper ends, `agreeing (M,)` ones at
-    those of others: they tell how much wrong loops agree by chance. In streets at right angles, or by motions that all
-    say the same place, they often do.
-    """
-    rng, chain, used = np.random.default_rng(5), pairwise.chain, pairwise.used
-    rows, every = np.flatnonzero(~used), np.arange(len(used))
-    for _ in range(DRAWN if (~used & ~agreeing).any() else 0):
-        others = rng.permutation(np.flatnonzero(~used & ~agreeing))
-        upper, apart = chain.ends[:, 1].copy(), np.flatnonzero(agreeing)
-        upper[others] = chain.ends[rng.permutation(others), 1]
-        swapped = np.resize(others, len(apart))
-        upper[apart], upper[swapped] = upper[swapped], chain.ends[apart, 1]
-        ends = np.sort(np.stack([chain.ends[:, 0], upper], axis=1), axis=1)
-        ends = np.where(np.ptp(ends, axis=1)[:, None] > 0, ends, chain.ends)
-        linear = linearise(chain.with_loops(every, ends), pairwise.linear.poses)
-        log_wrong, by_chain = pairwise.log_wrong.copy(), pairwise.by_chain.copy()
-        log_right, log_wrong[rows] = densities(linear, rows, outliers)
-        by_chain[rows] = np.logaddexp(shares[0] + log_right - log_wrong[rows], shares[1])
-        yield from agreed_breaks(PairwiseConsistency(linear, by_chain, log_wrong, used), usual)
 
 
 def bridged(chain: Chain, broken: Break) -> Chain:
