@@ -19,7 +19,7 @@ from hodge_pipeline.types import ViewGraph
 TURNED_RAD = {
     "walk of 900, 0.012 rad a step too much, 40% random wrong, stated × 1.0": 0.012,  # nothing was confirmed
     "walk of 900, 0.006 rad a step too much, 60% streets wrong, stated × 1.0": 0.006,  # two steps were called wrong
-    "walk of 300, 0.006 rad a step too much, 0%  wrong, stated × 1.0": 0.006,
+    "walk of 900, 0.006 rad a step too much, 80% random wrong, stated × 1.0": 0.006,
     "flight of 900, 0.012 rad a step too much, 0%  wrong, stated × 1.0": 0.012,
 }
 

@@ -38,7 +38,6 @@ def without_bias(chain: Chain, scales: Scales) -> Chain | None:
     if not len(rows):
         return None
     rows = rows[one_of_each_place(scaled.places[rows])]
-    rows = rows[np.unique(corridors(scaled.places[rows]), return_index=True)[1]]  # a mistaken one proposes any bias
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_CYCLES)).astype(np.int64)]
     scaled = scaled.with_loops(rows, chain.ends[rows])
     for _ in range(MOST_TURNED):
@@ -55,7 +54,7 @@ class _Cycles:
 
     - `turned (K, r, r)`: the rotation that a unit bias makes; `steps (K,)`: how many it is of.
     - `shared (K, K)`: the variance of each axis by the steps that two cycles share; `own (K,)`: by the loop itself;
-      `usual_rad`: standard deviation of a step.
+      `corridor (K,)`: that it is of; `usual_rad`: standard deviation of a step.
     """
 
     rotation: Floats
@@ -63,6 +62,7 @@ class _Cycles:
     steps: Ints
     shared: Floats
     own: Floats
+    corridor: Ints
     usual_rad: float
 
     @classmethod
@@ -85,6 +85,7 @@ class _Cycles:
             count[high] - count[low],
             np.maximum(shared, 0.0),
             of_loop,
+            corridors(chain.places),
             float(np.sqrt(np.median(of_step[measured]))),
         )
 
@@ -98,7 +99,9 @@ class _Cycles:
         gains = np.logaddexp(factor, 0.0)
         near = int(np.argmax(prior + gains.sum(axis=1)))
         agree, surely = np.flatnonzero(factor[near] > 0), BY_CHANCE + np.log(len(proposed))
-        if gains[near].sum() - gains[near].max() < surely:  # a single cycle agrees with its own proposal
+        by_corridor = np.zeros(self.corridor.max() + 1)
+        np.maximum.at(by_corridor, self.corridor, gains[near])
+        if by_corridor.sum() - by_corridor.max() < surely:  # a mistaken corridor agrees with its own proposal
             return np.zeros(self.rotation.shape[1])
         found = [self._likely(agree, proposed[near], times) for times in FACTORS]
         _, likeliest, bias = max(found, key=lambda each: each[1])
