@@ -90,6 +90,17 @@ def test_scans_of_one_place_are_joined_and_a_stranger_and_a_wall_are_left_apart(
     assert "falls into 3 pieces" in said
 
 
+def test_scans_that_were_registered_before_stay_where_they_lie_and_no_free_space_tests_them(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    frames = [scan(k, furnished_corner(k) - [1.0, 1.0, 1.0]) for k in range(3)]
+    frames.append(scan(3, furnished_corner(3)[:90_000] - [1.0, 1.0, 1.0]))  # its scanner saw no box and no ball
+    stranger = rng.uniform(-1, 1, (6, 1, 3)) + 0.25 * unit(rng.normal(size=(6, 3000, 3)))
+    found = started(tmp_path, [*frames, scan(4, stranger.reshape(-1, 3))])
+    assert found.piece.tolist() == [0, 0, 0, 0, 1]
+    assert np.abs(se3.log(found.world_from_cam)).max() < 0.02, "neither moved nor laid apart"
+    assert any(note.kind == "one frame" for note in found.notes)
+
+
 def test_a_single_scan_gives_no_pair_along_its_tour() -> None:
     none = propose_along_tour(
         SequentialEdges(), [scan(0, np.eye(3))], CloudSet.from_clouds([read(np.eye(3))]), np.eye(4)[None]
