@@ -14,7 +14,8 @@ from hodge_pipeline.registration.acceptance import SEEN_THROUGH
 from hodge_pipeline.registration.global_evidence import free_directions
 from hodge_pipeline.registration.global_features import FEWEST_POINTS
 from hodge_pipeline.start.unordered.hypotheses import RIVAL_OVERLAP
-from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, PointCloud
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, PointCloud
+from hodge_pipeline.types.edges import REJECTED
 
 SURFACE_NEIGHBOURS = 30
 SAMPLED_POINTS = 2000
@@ -48,9 +49,21 @@ def count_from_one_zero(hypotheses: Edges, room_m: float) -> bool:
     lie. Where rooms are alike most may fit wrongly. No scanner stood at that zero, so free space says nothing.
     """
     fits = hypotheses.counts | (hypotheses.why == SEEN_THROUGH)
-    twist = se3.log(hypotheses.i_from_j[fits])
-    lies = (np.linalg.norm(twist[:, 3:], axis=1) < SAME_M * room_m) & (np.linalg.norm(twist[:, :3], axis=1) < SAME_RAD)
-    return bool(len(lies)) and 3 * int(lies.sum()) >= len(lies)
+    lying = fits & _lie_on_each_other(hypotheses, room_m)
+    return bool(fits.any()) and 3 * int(lying.sum()) >= int(fits.sum())
+
+
+def within_their_frame(hypotheses: Edges, room_m: float) -> Edges:
+    """The table with every pair rejected whose scans both lie on others where they are, but on each other elsewhere."""
+    lying = _lie_on_each_other(hypotheses, room_m)
+    placed = np.isin(hypotheses.pairs, hypotheses.pairs[hypotheses.counts & lying]).all(axis=1)
+    return hypotheses.put(hypotheses.counts & placed & ~lying, status=REJECTED, why="elsewhere than in their frame")
+
+
+def _lie_on_each_other(hypotheses: Edges, room_m: float) -> Bools:
+    twist = se3.log(hypotheses.i_from_j)
+    is_near = np.linalg.norm(twist[:, 3:], axis=1) < SAME_M * room_m
+    return np.asarray(is_near & (np.linalg.norm(twist[:, :3], axis=1) < SAME_RAD))
 
 
 def unregistrable(cloud: PointCloud) -> str:

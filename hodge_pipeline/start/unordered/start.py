@@ -24,7 +24,12 @@ from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers, no_progress
 from hodge_pipeline.start.unordered.folds import Pieces, laid_apart, laid_at_first, unfolded
 from hodge_pipeline.start.unordered.hypotheses import AMBIGUOUS, ViewOf, weigh
 from hodge_pipeline.start.unordered.options import GlobalStart
-from hodge_pipeline.start.unordered.scan_checks import check_scans, count_from_one_zero, mirrored_scans
+from hodge_pipeline.start.unordered.scan_checks import (
+    check_scans,
+    count_from_one_zero,
+    mirrored_scans,
+    within_their_frame,
+)
 from hodge_pipeline.start.unordered.views import Views
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Ints, ViewGraph
 from hodge_pipeline.types.edges import REJECTED
@@ -149,6 +154,7 @@ def weighed_matches(
     if _are_scans(scene, by_image) and count_from_one_zero(hypotheses, options.limits.room_m):
         views = _no_view
         hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, workers)
+        hypotheses = within_their_frame(hypotheses, options.limits.room_m)
     if scene.drift is not None and options.diagnosis.trust != SEQUENTIAL:  # a backbone judges loops and its own steps
         counted = np.flatnonzero(hypotheses.counts)
         far = counted[contradicts_odometry(hypotheses.select(counted), scene.drift)]
