@@ -9,6 +9,7 @@ multiway registration (sweep to sweep, loops by position, its line process). CPU
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import os
 import tempfile
 import time
@@ -184,6 +185,8 @@ def main() -> None:
     parser.add_argument("--beams", type=int, nargs="+", default=[16])
     parser.add_argument("--sweeps", type=int, default=StreetOptions().frames)
     options = parser.parse_args()
+    if not importlib.util.find_spec("kiss_icp"):
+        parser.error("the peer is not installed: pip install kiss-icp, best into an environment of its own")
     print("| " + " | ".join(HEADER) + " |\n|" + "---|" * len(HEADER))
     for beams in options.beams:
         for seed in options.seeds:

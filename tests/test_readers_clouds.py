@@ -136,6 +136,25 @@ def test_map_coordinates_are_counted_from_the_whole_metres_of_their_middle(
     assert not any("counted from" in note for note in in_millimetres.notes), "5.4 km in metres"
 
 
+def test_map_coordinates_that_were_written_in_32_bits_are_told_with_their_step(tmp_path: Path) -> None:
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 2\n"
+    for name, kind, code in (("a", "float", "<f4"), ("b", "double", "<f8")):
+        points = FAR[:2].astype(np.float32).astype(code)
+        properties = "".join(f"property {kind} {axis}\n" for axis in "xyz")
+        (tmp_path / f"{name}.ply").write_bytes(f"{header}{properties}end_header\n".encode() + points.tobytes())
+        notes = CloudFolderReader().open(tmp_path / f"{name}.ply").notes
+        assert any("rounded to steps of 0.5 m" in note and "64 bits" in note for note in notes)
+        (tmp_path / f"{name}.ply").unlink()
+    (tmp_path / "a.ply").write_bytes(far_file("a.ply", False))
+    assert not any("rounded" in note for note in CloudFolderReader().open(tmp_path).notes)
+
+
+def test_tables_of_points_with_another_ending_are_named(tmp_path: Path) -> None:
+    (tmp_path / "scan.txt").write_text("1 2 3\n")
+    with pytest.raises(SourceError, match=r"tables of points are read as \.xyz, .*: scan\.txt"):
+        CloudFolderReader().open(tmp_path)
+
+
 def test_points_of_a_far_frame_are_written_from_whole_kilometres(tmp_path: Path) -> None:
     source = CloudFolderReader().open(fragments(tmp_path / "f", 1))
     pose = se3.from_parts(np.eye(3), FAR[0])

@@ -259,7 +259,7 @@ def test_points_that_are_rounded_far_from_zero_are_told(tmp_path: Path, kind: st
     log.add("/points", CLOUD, {"header": ros_header(100, "cam"), **cloud}, CDR)
     source = McapReader().open(log.write(tmp_path / "a.mcap"))
     told = any("/points: its points lie far from zero and are rounded" in note for note in source.notes)
-    assert told == (far == 5_400_000.123)
+    assert told == (far > 1e6)
     written = McapWriter().write(
         tmp_path / "out.mcap", replace(source, trajectory=Trajectory(np.array([100.0]), np.eye(4)[None]))
     )

@@ -165,6 +165,15 @@ def test_a_length_has_no_unit_where_none_is_known(report: Report) -> None:
     assert page.first[0].lines[0].endswith("it is 0.5 and 0.2° off the result.") or "0.50" in page.first[0].lines[0]
 
 
+def test_an_edge_that_fits_exactly_since_no_loop_passes_it_is_not_the_worst(report: Report) -> None:
+    exact = EdgeRow("1", "2", "overlap", 0.5, 1.0, 1e-17, 1e-15)
+    assert any(
+        "1–2 fits least" in place
+        for place in worst_places(replace(report, worst_edges=(replace(exact, residual_m=1.0),)))
+    )
+    assert not any("fits least" in place for place in worst_places(replace(report, worst_edges=(exact,))))
+
+
 def test_an_ignored_edge_is_not_called_used(report: Report) -> None:
     ignored = EdgeRow("1", "2", "overlap", 0.5, 0.0, 1.0, 20.0)
     assert not any("that the solver used" in str(line) for line in suspicions(replace(report, worst_edges=(ignored,))))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -32,10 +33,10 @@ from hodge_pipeline.start.unordered.hypotheses import (
     allowed_violation,
 )
 from hodge_pipeline.start.unordered.options import GlobalStart, HypothesisLimits
-from hodge_pipeline.start.unordered.scan_checks import check_scans, mirrored_scans, unregistrable
+from hodge_pipeline.start.unordered.scan_checks import check_scans, mirrored_scans, unregistrable, within_their_frame
 from hodge_pipeline.start.unordered.start import Frames, Start, _ambiguous_pairs, _none_joined, find_start
 from hodge_pipeline.start.unordered.tour import propose_along_tour, tour
-from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, PointCloud, Source, ViewGraph
+from hodge_pipeline.types import Camera, CloudSet, Edges, Floats, Frame, PointCloud, Registration, Source, ViewGraph
 from hodge_pipeline.types.edges import REJECTED, USED
 from hodge_pipeline.types.notes import Note
 from scan_data import write_e57
@@ -88,6 +89,26 @@ def test_scans_of_one_place_are_joined_and_a_stranger_and_a_wall_are_left_apart(
     said = "\n".join(map(str, found.notes))
     assert "scan 4: cannot be registered by its shape: its surfaces leave open" in said
     assert "falls into 3 pieces" in said
+
+
+def test_scans_that_were_registered_before_stay_where_they_lie_and_no_free_space_tests_them(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    frames = [scan(k, furnished_corner(k) - [1.0, 1.0, 1.0]) for k in range(3)]
+    frames.append(scan(3, furnished_corner(3)[:90_000] - [1.0, 1.0, 1.0]))  # its scanner saw no box and no ball
+    stranger = rng.uniform(-1, 1, (6, 1, 3)) + 0.25 * unit(rng.normal(size=(6, 3000, 3)))
+    found = started(tmp_path, [*frames, scan(4, stranger.reshape(-1, 3))])
+    assert found.piece.tolist() == [0, 0, 0, 0, 1]
+    assert np.abs(se3.log(found.world_from_cam)).max() < 0.02, "neither moved nor laid apart"
+    assert any(note.kind == "one frame" for note in found.notes)
+
+
+def test_rooms_alike_of_one_frame_are_not_laid_on_each_other_and_a_scan_of_another_frame_is_joined() -> None:
+    along = se3.exp(np.array([0, 0, 0, 8.0, 0, 0]))
+    pairs = np.array([[0, 1], [2, 3], [0, 2], [1, 4]])  # 0 and 1 in a room, 2 and 3 in one like it, 4 of another frame
+    found = Registration(np.eye(4), np.eye(6), 0.9, 0.01, 500, 5, True)
+    elsewhere = replace(found, i_from_j=along)
+    edges = Edges.of(pairs).with_registrations([found, found, elsewhere, elsewhere])
+    assert within_their_frame(edges.put(slice(None), status=USED), 1.0).counts.tolist() == [True, True, False, True]
 
 
 def test_a_single_scan_gives_no_pair_along_its_tour() -> None:

@@ -11,6 +11,9 @@ from hodge_pipeline.report.error_plots import has_truth, offsets
 from hodge_pipeline.report.verdict import capital
 from hodge_pipeline.types.text import command
 
+EXACT = 1e-9
+"""Metres and degrees: residuals below are those of arithmetic, as of edges that no loop passes (1e-17 to 1e-13)."""
+
 
 def peak(total: StageRow) -> str:
     """`, at most 800 MB`; nothing where memory was not measured."""
@@ -32,7 +35,7 @@ def worst_places(report: Report) -> Iterator[str]:
         what = f"lies {off} off the truth" if has_truth(report) else f"was moved by {off}"
         where = "in the refinement, which is not kept, " if report.shows_rejected else ""
         yield capital(f"{where}{name} {what}, more than any other.")
-    used = [edge for edge in report.worst_edges if edge.weight > 0]
+    used = [edge for edge in report.worst_edges if edge.weight > 0 and max(edge.residual_m, edge.residual_deg) > EXACT]
     if used:
         off = f"{report.length(used[0].residual_m)} and {used[0].residual_deg:.2g}°"
         verdict = f" ({used[0].verdict})" if used[0].verdict else ""

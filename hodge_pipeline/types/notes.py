@@ -83,6 +83,8 @@ LOOKS = {
     "reader's notes tell what was read",
     "option unknown": "{detail}; made by another version: it is left out of what is shown",
     "other units": "{detail}",
+    "one frame": "the scans fit each other where they lie, as scans do that were registered before: they stay in that "
+    "frame, and free space, which needs the place of each scanner, tests no pair",
     "mirrored": "scan {detail} seems mirrored, and is left apart: its reflection fits the scans around it clearly "
     "better (an axis of the wrong sign, or a left-handed frame?)",
     "not a video": "{count} frames are numbered, and nothing tells how many make a second: each is registered, "

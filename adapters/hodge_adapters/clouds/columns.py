@@ -30,6 +30,8 @@ REVOLUTION_S = (0.01, 2.0)
 NAMES = frozenset((*"xyz", *COLOURS, *PACKED, *NORMALS[0], *NORMALS[1]))
 MAX_METRES = 1e9
 """A point with a coordinate beyond counts as one without numbers: no map of the Earth has it."""
+COARSE_M = 1e-3
+"""Steps of coordinates from which on they hide what a terrestrial scanner measures; 32 bits have them beyond 16 km."""
 ROWS_IN_PART, LINES_IN_PART = 1 << 20, 1 << 17
 """Read at once: so a file of any length takes some tens of megabytes."""
 Columns: TypeAlias = Mapping[str, Any]
@@ -103,16 +105,35 @@ def far_corner(columns: Columns, units_per_metre: float) -> Corner:
 
     A scanner's reach, and with it the size of a sweep's voxels, is counted from there.
     """
-    axes = [np.asarray(columns[axis]) for axis in "xyz" if axis in columns]
+    axes = [columns[axis] for axis in "xyz" if axis in columns]
     if len(axes) < 3 or np.result_type(np.float32, *axes) == np.float32:
         return ZERO
-    points = np.column_stack(axes)
-    with np.errstate(invalid="ignore"):
-        points = points[(np.abs(points) < MAX_METRES).all(axis=1)]
-    if not whole_kilometres(points / units_per_metre).any():
+    points = _far_points(columns, units_per_metre)
+    if not len(points):
         return ZERO
     x, y, z = (units_per_metre * np.round(np.median(points, axis=0) / units_per_metre)).tolist()
     return x, y, z
+
+
+def coarse_step(columns: Columns, units_per_metre: float) -> float:
+    """The step in metres to which the points of columns were rounded as 32-bit numbers far from zero, whatever type
+    the columns have now; zero where they have more digits, or finer steps than `COARSE_M`.
+    """
+    points = _far_points(columns, units_per_metre)
+    if not len(points) or not np.array_equal(points, points.astype(np.float32)):
+        return 0.0
+    step = float(np.spacing(np.float32(np.abs(np.median(points, axis=0)).max()))) / units_per_metre
+    return step if step >= COARSE_M else 0.0
+
+
+def _far_points(columns: Columns, units_per_metre: float) -> Floats:
+    """The points of columns, in their units, where their middle is far from zero; else none."""
+    if not all(axis in columns for axis in "xyz"):
+        return np.zeros((0, 3))
+    points = np.column_stack([np.asarray(columns[axis], float) for axis in "xyz"])
+    with np.errstate(invalid="ignore"):
+        points = points[(np.abs(points) < MAX_METRES).all(axis=1)]
+    return points if whole_kilometres(points / units_per_metre).any() else np.zeros((0, 3))
 
 
 def unpacked(columns: dict[str, Any]) -> dict[str, Any]:

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hodge_adapters.clouds.columns import ZERO, Columns, Corner, far_corner, points_of_parts
+from hodge_adapters.clouds.columns import ZERO, Columns, Corner, coarse_step, far_corner, points_of_parts
 from hodge_adapters.clouds.kitti import raised, read_bin
 from hodge_adapters.clouds.npy import npy_parts
-from hodge_adapters.clouds.pcd import exceeds_float32, pcd_parts
+from hodge_adapters.clouds.pcd import pcd_parts
 from hodge_adapters.clouds.ply import ply_parts
 from hodge_adapters.clouds.scan_files import LIBRARIES, Scan, e57_parts, e57_scans, las_corner, las_parts
 from hodge_adapters.clouds.tables import table_parts
@@ -77,7 +77,12 @@ def fragments_of(files: list[Path], units_per_metre: float, notes: list[str]) ->
     if corner is not None and any(corner):
         words = " ".join(f"{value:.0f}" for value in corner)
         notes.append(f"coordinates of {len(las)} LAS files are counted from their middle {words}")
-    far = _far_corner(others[0], units_per_metre) if others else ZERO
+    far, step_m = _far_corner(others[0], units_per_metre) if others else (ZERO, 0.0)
+    if step_m:
+        notes.append(
+            f"{others[0].name}: was written far from zero in 32-bit numbers, rounded to steps of {step_m:.2g} m there: "
+            "export it in 64 bits, or counted from a corner near it"
+        )
     if any(far):
         far = corner if corner is not None and any(corner) else far
         words = " ".join(f"{value:.0f}" for value in far)
@@ -98,17 +103,17 @@ def _e57_scans(file: Path, *, is_alone: bool) -> list[Scan]:
         return []  # said where the cloud is read
 
 
-def _far_corner(fragment: Fragment, units_per_metre: float) -> Corner:
-    """The corner to count from by the first points of a fragment; zero where it is turned as a whole."""
-    pose = fragment.in_metres(units_per_metre)
-    if pose is not None and not np.array_equal(pose[:3, :3], np.eye(3)):
-        return ZERO
+def _far_corner(fragment: Fragment, units_per_metre: float) -> tuple[Corner, float]:
+    """By the first points of a fragment the corner to count from, zero where it is turned as a whole, and the step in
+    metres to which they were rounded.
+    """
     try:
-        if fragment.path.suffix.lower() == ".pcd" and not exceeds_float32(fragment.path):
-            return ZERO
-        return far_corner(next(_parts(fragment)), units_per_metre)
+        part = next(_parts(fragment))
     except SourceError:  # said where the cloud is read
-        return ZERO
+        return ZERO, 0.0
+    pose = fragment.in_metres(units_per_metre)
+    is_turned = pose is not None and not np.array_equal(pose[:3, :3], np.eye(3))
+    return ZERO if is_turned else far_corner(part, units_per_metre), coarse_step(part, units_per_metre)
 
 
 def _parts(fragment: Fragment) -> Iterator[Columns]:

@@ -22,7 +22,7 @@ from hodge_adapters.clouds.columns import (
 )
 from hodge_adapters.text_rows import reading
 from hodge_pipeline.errors import SourceError
-from hodge_pipeline.types.input_files import beginning, read_input
+from hodge_pipeline.types.input_files import read_input
 
 MAX_HEADER_BYTES = 1 << 14
 MAX_EXPANSION = 264
@@ -54,12 +54,6 @@ def pcd_parts(path: Path) -> Iterator[dict[str, Any]]:
     header = _read_header(path, contents)
     read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}[header.kind]
     return map(unpacked, read(path, contents, header))
-
-
-def exceeds_float32(path: Path) -> bool:
-    """Whether its coordinates may have more digits than float32: text and doubles."""
-    header = _read_header(path, beginning(path, MAX_HEADER_BYTES))
-    return header.kind == "ascii" or ("x", "<f8", 1) in header.fields
 
 
 def expand_lzf(compressed: bytes, size: int) -> bytearray | None:

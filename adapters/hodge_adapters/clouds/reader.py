@@ -32,6 +32,8 @@ from hodge_pipeline.types.positions import whole_kilometres
 from hodge_pipeline.types.text import counted
 
 OTHER_SCANS = frozenset((".pts", ".ptx", ".obj", ".stl", ".off", ".ptc", ".fls", ".rcp"))
+TABLES = frozenset((".csv", ".txt", ".pts"))
+"""Endings of files that may be tables of points as they are."""
 TOLD_BY = {".csv": names_points, ".npy": holds_points}
 """Files of these endings hold many things: the beginning of one tells whether it holds points."""
 _NUMBER = re.compile(r"(\d{1,19})\D*$")
@@ -147,6 +149,10 @@ class CloudFolderReader:
                 f"{told}: convert to PLY"
             )
         if not found:
+            if tables := {file for file in listing if file.suffix.lower() in TABLES}:
+                unread.append(
+                    f"tables of points are read as .xyz, x y z first or named above the rows: {_listed(tables)}"
+                )
             why = "; ".join(unread) or "give a folder of fragments"
             raise SourceError(f"{path}: no {', '.join(ENDINGS)} like {self.pattern!r} in it: {why}")
         notes += unread

@@ -17,6 +17,8 @@ from hodge_pipeline.types.input_files import open_input
 
 SEPARATORS, DECIMAL_COMMAS = bytes.maketrans(b",;", b"  "), bytes.maketrans(b",;", b". ")
 """Between numbers, where a comma is one; where there are semicolons, it is none."""
+DECIMAL_ROW = re.compile(r"\s*[-+]?\d+(,\d+)?(\s+[-+]?\d+(,\d+)?){2,}\s*")
+"""Numbers between blanks that have a comma each at most, such as `1,5 -2,25 3`: as decimal point."""
 COMMENTS = (b"#", b"//")
 
 
@@ -42,7 +44,7 @@ def table_parts(path: Path) -> Iterator[Columns]:
         elif not is_comment:
             row = line
             break
-    separators = DECIMAL_COMMAS if ";" in row else SEPARATORS
+    separators = DECIMAL_COMMAS if ";" in row or DECIMAL_ROW.fullmatch(row) else SEPARATORS
     width = len(names) or len(row.encode().translate(separators).split())
     if width < 3:
         raise SourceError(f"{path}: its first line holds no x, y and z: give a file of points")

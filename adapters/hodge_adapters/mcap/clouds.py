@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_adapters.clouds.columns import far_corner, is_time, points_of_columns, unpacked
+from hodge_adapters.clouds.columns import coarse_step, far_corner, is_time, points_of_columns, unpacked
 from hodge_adapters.mcap.fields import Message, Payload, part, parts, pose_values, text, whole
 from hodge_adapters.mcap.records import Malformed
 from hodge_pipeline import se3
@@ -88,12 +88,13 @@ def read_points(payload: Payload, layout: CloudLayout) -> PointCloud:
     return replace(cloud, points_in_cam=points, normals_in_cam=turned)
 
 
-def lies_far(payload: Payload, layout: CloudLayout) -> bool:
-    """Whether the points are doubles so far from zero that float32 has no room for them; raises `SourceError`."""
-    if not any(name == "x" and kind.endswith("f8") for name, kind, _ in layout.fields):
-        return False
+def is_rounded(payload: Payload, layout: CloudLayout) -> bool:
+    """Whether the points lie so far from zero that float32 rounds them, here or where they were written; raises
+    `SourceError`.
+    """
     columns = _columns(payload, layout, payload.read())
-    return any(far_corner({axis: columns[axis] for axis in "xyz"}, 1.0))
+    axes = {axis: columns[axis] for axis in "xyz"}
+    return any(far_corner(axes, 1.0)) or coarse_step(axes, 1.0) > 0
 
 
 def _checked(

@@ -20,7 +20,7 @@ from hodge_adapters.images.camera_files import Intrinsics, checked
 from hodge_adapters.images.frames import Lens
 from hodge_adapters.images.second_camera import SecondCamera
 from hodge_adapters.mcap.cameras import find_camera, second_cameras
-from hodge_adapters.mcap.clouds import lies_far
+from hodge_adapters.mcap.clouds import is_rounded
 from hodge_adapters.mcap.files import find_files, sniff_recording
 from hodge_adapters.mcap.fixes import positions_of
 from hodge_adapters.mcap.frames import cloud_frames, colour_frames, depth_frames
@@ -223,7 +223,7 @@ class McapReader:
     def _cloud_frames(self, recording: Recording, notes: list[str]) -> tuple[list[Frame], str]:
         topic = self._pick(recording.clouds, self.points_topic, "points_topic", notes)
         clouds = one_per_stamp(topic, recording.clouds[topic], notes)
-        if lies_far(clouds[0].payload, clouds[0].layout):
+        if is_rounded(clouds[0].payload, clouds[0].layout):
             notes.append(
                 f"{topic}: its points lie far from zero and are rounded, since 32-bit numbers lose digits there"
             )

@@ -144,5 +144,10 @@ def laid_apart(piece: Ints, piece_from: Floats, clouds: CloudSet) -> Floats:
     `piece (N,)`, `piece_from (N, 4, 4)`: the piece of each frame and its pose in it. Pieces lie so far apart that
     no cloud reaches another's.
     """
+    return apart_along_x(laid_at_first(piece, piece_from), piece, REACHES_APART * clouds.reach_m)
+
+
+def laid_at_first(piece: Ints, piece_from: Floats) -> Floats:
+    """Poses (N, 4, 4) in one world where each piece begins with the identity at its first frame."""
     first = np.unique(piece, return_index=True)[1]
-    return apart_along_x(se3.inverse(piece_from[first])[piece] @ piece_from, piece, REACHES_APART * clouds.reach_m)
+    return np.asarray(se3.inverse(piece_from[first])[piece] @ piece_from)

@@ -9,10 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from hodge_pipeline import se3
+from hodge_pipeline.registration.acceptance import SEEN_THROUGH
 from hodge_pipeline.registration.global_evidence import free_directions
 from hodge_pipeline.registration.global_features import FEWEST_POINTS
 from hodge_pipeline.start.unordered.hypotheses import RIVAL_OVERLAP
-from hodge_pipeline.types import CloudSet, Edges, Floats, Ints, PointCloud
+from hodge_pipeline.types import Bools, CloudSet, Edges, Floats, Ints, PointCloud
+from hodge_pipeline.types.edges import REJECTED
 
 SURFACE_NEIGHBOURS = 30
 SAMPLED_POINTS = 2000
@@ -23,6 +26,9 @@ POORER = 0.5
 poor, and matching costs seconds, but decides nothing by itself."""
 PARTNERS = 3
 """Scans that a reflection is matched with: those that the scan itself overlaps most."""
+SAME_M, SAME_RAD = 0.1, np.radians(1.0)
+"""Metres in a room and radians within which two scans lie on each other as they come: GICP errs by a tenth of that; of
+two scanners that stand at one spot, turned at random, one in 180 pairs does."""
 
 Match = Callable[[CloudSet, Path], Edges]
 """All pairs of a few clouds, matched and weighed; the folder is for scratch."""
@@ -36,6 +42,28 @@ def check_scans(clouds: CloudSet, names: NDArray[np.generic]) -> tuple[str, ...]
         if reason:
             notes.append(f"scan {name}: cannot be registered by its shape: {reason}")
     return tuple(notes)
+
+
+def count_from_one_zero(hypotheses: Edges, room_m: float) -> bool:
+    """Whether scans were registered before, all in one frame: a third or more of the pairs that fit do so where they
+    lie. Where rooms are alike most may fit wrongly. No scanner stood at that zero, so free space says nothing.
+    """
+    fits = hypotheses.counts | (hypotheses.why == SEEN_THROUGH)
+    lying = fits & _lie_on_each_other(hypotheses, room_m)
+    return bool(fits.any()) and 3 * int(lying.sum()) >= int(fits.sum())
+
+
+def within_their_frame(hypotheses: Edges, room_m: float) -> Edges:
+    """The table with every pair rejected whose scans both lie on others where they are, but on each other elsewhere."""
+    lying = _lie_on_each_other(hypotheses, room_m)
+    placed = np.isin(hypotheses.pairs, hypotheses.pairs[hypotheses.counts & lying]).all(axis=1)
+    return hypotheses.put(hypotheses.counts & placed & ~lying, status=REJECTED, why="elsewhere than in their frame")
+
+
+def _lie_on_each_other(hypotheses: Edges, room_m: float) -> Bools:
+    twist = se3.log(hypotheses.i_from_j)
+    is_near = np.linalg.norm(twist[:, 3:], axis=1) < SAME_M * room_m
+    return np.asarray(is_near & (np.linalg.norm(twist[:, :3], axis=1) < SAME_RAD))
 
 
 def unregistrable(cloud: PointCloud) -> str:

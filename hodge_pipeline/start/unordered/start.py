@@ -21,10 +21,15 @@ from hodge_pipeline.registration.odometry_path import contradicts_odometry
 from hodge_pipeline.scene import Drift
 from hodge_pipeline.solvers.backbone.trust import SEQUENTIAL
 from hodge_pipeline.stages import Advance, GlobalRegistrar, Workers, no_progress
-from hodge_pipeline.start.unordered.folds import Pieces, laid_apart, unfolded
-from hodge_pipeline.start.unordered.hypotheses import AMBIGUOUS, weigh
+from hodge_pipeline.start.unordered.folds import Pieces, laid_apart, laid_at_first, unfolded
+from hodge_pipeline.start.unordered.hypotheses import AMBIGUOUS, ViewOf, weigh
 from hodge_pipeline.start.unordered.options import GlobalStart
-from hodge_pipeline.start.unordered.scan_checks import check_scans, mirrored_scans
+from hodge_pipeline.start.unordered.scan_checks import (
+    check_scans,
+    count_from_one_zero,
+    mirrored_scans,
+    within_their_frame,
+)
 from hodge_pipeline.start.unordered.views import Views
 from hodge_pipeline.types import CloudSet, Edges, Floats, Floats32, Frame, Ints, ViewGraph
 from hodge_pipeline.types.edges import REJECTED
@@ -67,7 +72,7 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     hypotheses, views = weighed_matches(scene, np.flatnonzero(clouds.sizes > 0), options, scratch, workers, advance)
     notes.append(tried(int((clouds.sizes > 0).sum()), hypotheses))
     mirrored = np.zeros(0, np.int64)
-    if not by_image and scene.given is None and all(frame.camera is None for frame in scene.frames):
+    if _are_scans(scene, by_image):
         alike = partial(_matched_alone, options=options, workers=workers)
         mirrored = mirrored_scans(clouds, hypotheses, alike, scratch)
         of_mirrored = np.flatnonzero(hypotheses.counts & np.isin(hypotheses.pairs, mirrored).any(axis=1))
@@ -83,13 +88,22 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     pieces = unfolded(clouds, pieces, given, views, options.diagnosis, options.limits.room_m)
     notes += [*pieces.notes, *describe_components(pieces.piece, scene.vertex_ids)]
     advance(len(scene.frames))
-    poses = laid_apart(pieces.piece, pieces.poses, clouds)
+    in_one_frame = _are_scans(scene, by_image) and count_from_one_zero(hypotheses, options.limits.room_m)
+    lay = laid_at_first if in_one_frame else partial(laid_apart, clouds=clouds)
+    poses = lay(pieces.piece, pieces.poses)
     told = (
+        *((Note("one frame"),) if in_one_frame else ()),
         *(Note("mirrored", detail=str(scene.vertex_ids[row])) for row in mirrored),
         *_ambiguous_pairs(hypotheses, pieces.piece),
         *_none_joined(scene, hypotheses, pieces.piece),
     )
     return Start(poses, Edges.measured(pieces.graph), pieces.piece, (*told, *notes_of("start", notes)))
+
+
+def _are_scans(scene: Frames, by_image: bool) -> bool:
+    """Whether the frames are scans alone, in no order."""
+    is_ordered = scene.given is not None or scene.drift is not None
+    return not (by_image or is_ordered) and all(frame.camera is None for frame in scene.frames)
 
 
 def _matched_alone(clouds: CloudSet, folder: Path, options: GlobalStart, workers: Workers) -> Edges:
@@ -119,8 +133,9 @@ def _none_joined(scene: Frames, hypotheses: Edges, piece: Ints) -> tuple[Note, .
 
 def weighed_matches(
     scene: Frames, rows: Ints, options: GlobalStart, scratch: Path, workers: Workers, advance: Advance
-) -> tuple[Edges, Views]:
-    """The matched pairs of these rows, with status used where they may be edges, and the depth views of the frames.
+) -> tuple[Edges, ViewOf]:
+    """The matched pairs of these rows, with status used where they may be edges, and the depth views of the frames;
+    none of scans that no scanner saw from their zero.
 
     `advance` counts frames as they are described into the folder `scratch`.
     """
@@ -134,13 +149,21 @@ def weighed_matches(
     if not options.similar_per_frame:  # only what the loops pair needs a description
         describe_clouds(scene.clouds, registrar, np.unique(pairs), described, workers, advance)
     matches = match_pairs(described, registrar, pairs, workers)
-    views = Views.make(scene.frames, clouds, rows, scratch / "views", workers)
+    views: ViewOf = Views.make(scene.frames, clouds, rows, scratch / "views", workers)
     hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, workers)
+    if _are_scans(scene, by_image) and count_from_one_zero(hypotheses, options.limits.room_m):
+        views = _no_view
+        hypotheses = weigh(scene.clouds, matches, views, options.refine, options.limits, workers)
+        hypotheses = within_their_frame(hypotheses, options.limits.room_m)
     if scene.drift is not None and options.diagnosis.trust != SEQUENTIAL:  # a backbone judges loops and its own steps
         counted = np.flatnonzero(hypotheses.counts)
         far = counted[contradicts_odometry(hypotheses.select(counted), scene.drift)]
         hypotheses = hypotheses.put(far, status=REJECTED, why=CONTRADICTS)
     return hypotheses.put(slice(None), proposed_by="landmarks" if by_image else "features"), views
+
+
+def _no_view(row: int) -> None:
+    """In the place of views where free space is unknown."""
 
 
 def uses_images(clouds: CloudSet, options: GlobalStart) -> bool:
