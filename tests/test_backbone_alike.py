@@ -28,8 +28,9 @@ def test_loops_that_take_a_part_of_the_world_for_the_next_are_left_out_and_told(
     case = next(each for each in alike_cases(1) if each.name == name)
     found = diagnose(case.graph)
     np.testing.assert_array_equal(found.kept, case.right)
-    assert found.shared_mistake in found.notes and found.shared_mistake in sentence(case.graph, found)
-    count, shift = found.shared_mistake.split(" loops left out agree on a shift of ")
+    (told,) = found.findings
+    assert told in found.notes and told in sentence(case.graph, found)
+    count, shift = told.split(" loops left out agree on a shift of ")
     assert int(count) == (~case.right).sum()
     assert float(shift.split(" m: places that look alike")[0]) == pytest.approx(TOLD_BY[name], abs=0.2)
 
@@ -48,7 +49,7 @@ def test_a_shift_without_a_scale_is_told_in_no_metres(monkeypatch: pytest.Monkey
 @pytest.mark.parametrize("seed", range(3))
 def test_random_loops_share_no_shift(seed: int) -> None:
     found = diagnose(drive(seed=seed, world="town", wrong=0.6).graph)
-    assert not found.shared_mistake
+    assert not found.findings
 
 
 def test_loops_that_shift_this_way_and_that_agree_on_none(data_dir: Path) -> None:
@@ -57,4 +58,4 @@ def test_loops_that_shift_this_way_and_that_agree_on_none(data_dir: Path) -> Non
     assert source.graph is not None
     backbone = find_backbone(source.graph)
     assert backbone is not None
-    assert "194 of 270 loops confirmed" in backbone.notes[0] and not backbone.shared_mistake
+    assert "194 of 270 loops confirmed" in backbone.notes[0] and not backbone.findings

@@ -58,7 +58,7 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone) -> Diagnosis:
         witnesses=(np.where(kept[:, None], witness, -1), np.where(kept[:, None], -1, witness)),
         world_from_cam=backbone.world_from_cam,
         tested=backbone.notes,
-        shared_mistake=backbone.shared_mistake,
+        findings=backbone.findings,
     )
 
 

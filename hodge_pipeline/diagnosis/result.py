@@ -36,7 +36,8 @@ class Diagnosis:
     - `cycles`; `witnesses_for`, `witnesses_against (E, 3)`: their rows, the most telling first, −1 for none.
     - `piece (V,)`: 0 the largest; `world_from_cam (V, 4, 4)`: each piece in the frame of its lowest id.
     - `network`: of the kept edges as resistors.
-    - `notes`: counts and caveats, one line each; `shared_mistake`: what wrong edges agree on, a line, or empty.
+    - `notes`: counts and caveats, one line each; `findings`: those on what is wrong with many
+      edges at once.
     """
 
     verdict: NDArray[str_]
@@ -54,7 +55,7 @@ class Diagnosis:
     world_from_cam: Floats
     network: Network
     notes: tuple[str, ...]
-    shared_mistake: str = ""
+    findings: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -70,7 +71,7 @@ class Diagnosis:
         witnesses: tuple[Ints, Ints],
         world_from_cam: Floats,
         tested: tuple[str, ...],
-        shared_mistake: str = "",
+        findings: tuple[str, ...] = (),
     ) -> Diagnosis:
         """The diagnosis with these verdicts, whose pieces are those of the kept edges; `reasons` makes the lines from
         residuals (E,), metres and degrees; `tested`: notes on what tested the edges.
@@ -85,7 +86,7 @@ class Diagnosis:
         leverage = np.where(kept, 1 - 1 / (1 + effective_resistance(graph.edges, kept, network)), 0.0)
         notes = f"edges: {count_verdicts(verdict)}", *tested, *describe_components(piece, graph.vertex_ids)
         columns = verdict, probability, reasons(residual), kept, *residual, leverage, graph.information, cycles
-        return cls(*columns, *witnesses, network.component, world_from_cam, network, notes, shared_mistake)
+        return cls(*columns, *witnesses, network.component, world_from_cam, network, notes, findings)
 
     def __repr__(self) -> str:
         return f"Diagnosis({len(self.verdict)} edges: {count_verdicts(self.verdict)})"

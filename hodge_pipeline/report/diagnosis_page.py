@@ -88,18 +88,17 @@ def sentence(graph: ViewGraph, diagnosis: Diagnosis) -> str:
     if not graph.edge_count:
         return "The graph has no edge: there is nothing to judge."
     if not any(counts.values()):
-        return f"All {graph.edge_count} edges are consistent with each other."
+        return "; ".join((f"All {graph.edge_count} edges are consistent with each other", *diagnosis.findings)) + "."
     told = []
     if counts[WRONG]:
         worst = int(ranked(diagnosis)[0])
         i, j = graph.vertex_ids[graph.edges[worst]]
         told.append(f"{counted(counts[WRONG], 'is|are')} wrong, worst of all {i}–{j}")
-    if diagnosis.shared_mistake:
-        told.append(diagnosis.shared_mistake)
     if counts[SUSPECT]:
         told.append(f"{counted(counts[SUSPECT], 'is|are')} suspect")
     told += _untestable(graph, diagnosis)
-    return "; ".join(told).replace(" ", f" of {graph.edge_count} edges ", 1) + "."
+    told[0] = told[0].replace(" ", f" of {graph.edge_count} edges ", 1)
+    return "; ".join((*told, *diagnosis.findings)) + "."
 
 
 def _untestable(graph: ViewGraph, diagnosis: Diagnosis) -> list[str]:

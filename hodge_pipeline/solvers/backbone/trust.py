@@ -133,8 +133,15 @@ class Backbone:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Which edges are trusted, and how many loops they confirm; and `shared_mistake`."""
-        return self._trusted, *((self.shared_mistake,) if self.shared_mistake else ())
+        """Which edges are trusted, and how many loops they confirm; and `findings`."""
+        return self._trusted, *self.findings
+
+    @cached_property
+    def findings(self) -> tuple[str, ...]:
+        """What is wrong with many edges at once: the bias of steps, and a shift that unused loops share."""
+        turn_deg = np.degrees(np.linalg.norm(self.chain.bias))
+        biased = f"{self.named} turn {turn_deg:.2g}° too far each, which is taken out" if turn_deg else ""
+        return tuple(each for each in (biased, self._shared_mistake) if each)
 
     @property
     def _trusted(self) -> str:
@@ -152,13 +159,10 @@ class Backbone:
             errors = f"; these edges then err {scales.of_steps:.2g} times what they state, or the loops are wrong alike"
         else:
             errors = ""
-        if self.chain.bias.any():
-            turn_deg = np.degrees(np.linalg.norm(self.chain.bias))
-            errors += f"; a turn of {turn_deg:.2g}° that each of them has too much is taken out"
         return f"{trusted}{called_wrong}, {used} of {loops} loops confirmed{errors}"
 
-    @cached_property
-    def shared_mistake(self) -> str:
+    @property
+    def _shared_mistake(self) -> str:
         """Where most unused loops agree on one shift in the world's axes: how many, and how far; else empty."""
         found, first = self.found, next(self.found.mistakes(), None)
         if first is None or first.nats < BY_CHANCE:
