@@ -10,6 +10,7 @@ from scipy.special import chdtri
 
 from hodge_pipeline.complex.chi2 import chi2_by_information, tail_gate, tail_weight
 from hodge_pipeline.solvers.priors import with_world
+from hodge_pipeline.solvers.weights import PLANAR_AXES, dimension_of, edge_weights
 from hodge_pipeline.types import Bools, Floats, Ints, Priors, ViewGraph
 from hodge_pipeline.types.text import counted
 
@@ -29,6 +30,7 @@ def right_priors(graph: ViewGraph, priors: Priors, solved: Callable[[ViewGraph],
 
     `solved` gives the poses (V, 4, 4) of a graph with its priors. Priors may err more than they state, as all do alike.
     """
+    priors = as_solved(graph, priors)
     axes = _axes(priors)
     every, weights = np.ones(len(axes), bool), np.ones(len(axes))
     gate, middle = np.zeros((2, len(axes)))
@@ -46,7 +48,20 @@ def right_priors(graph: ViewGraph, priors: Priors, solved: Callable[[ViewGraph],
         if np.abs(weights - before).max() < SETTLED:
             break
     right = scaled <= gate
-    return right if (~right).sum() < MOST_WRONG * len(right) else every
+    return right if (~right).sum() < MOST_WRONG * (axes > 0).sum() else every
+
+
+def as_solved(graph: ViewGraph, priors: Priors) -> Priors:
+    """The priors with the information that a solve heeds: of a planar graph that in the plane, of others none that
+    lacks axes of both rotation and translation.
+    """
+    whole, _ = with_world(graph, priors, None, None)
+    of_priors, dimension = whole.select(np.arange(graph.edge_count, whole.edge_count)), dimension_of(graph)
+    axes = PLANAR_AXES if dimension == 2 else np.arange(6)
+    heeded = np.ix_(edge_weights(of_priors, dimension).used, axes, axes)
+    information = np.zeros(of_priors.information.shape)
+    information[heeded] = of_priors.information[heeded]
+    return replace(priors, information=information)
 
 
 def chi2_of_priors(graph: ViewGraph, priors: Priors, world_from_cam: Floats) -> Floats:
@@ -57,6 +72,7 @@ def chi2_of_priors(graph: ViewGraph, priors: Priors, world_from_cam: Floats) -> 
 
 def excess_of_priors(graph: ViewGraph, priors: Priors, world_from_cam: Floats) -> float:
     """By how many times what they state priors are off, √(mean χ² of an axis)."""
+    priors = as_solved(graph, priors)
     return float(np.sqrt(chi2_of_priors(graph, priors, world_from_cam).sum() / max(_axes(priors).sum(), 1)))
 
 
