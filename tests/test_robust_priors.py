@@ -67,6 +67,16 @@ def test_what_no_solve_heeds_of_a_fix_contradicts_nothing() -> None:
     assert solve_robust(replace(raised, priors=spatial)).metrics["priors_excess"] < 1.5
 
 
+def test_headings_that_contradict_the_edges_are_told_in_degrees() -> None:
+    """ "0 m off"."""
+    made = drive(wrong=0.3, loops=60)
+    turned = se3.exp(np.outer(np.arange(40) == 7, [0, 0, 1.0, 0, 0, 0]))
+    known = np.tile(np.diag([1, 1, 1, 0, 0, 0]) * 1e4, (40, 1, 1))
+    priors = Priors(np.arange(0, 400, 10), made.truth[::10] @ turned, known)
+    note = solve_robust(replace(made.graph, priors=priors)).notes[0]
+    assert note.startswith("1 prior is left out of 40") and "that of vertex 70 is 5" in note and note.endswith("° off")
+
+
 def test_fixes_that_err_more_than_they_state_all_count() -> None:
     made = with_fixes(drive(wrong=0.3, loops=60), np.random.default_rng(5).normal(0, 1.5, (40, 3)) * [1, 1, 0])
     found = solve_robust(made.graph)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
+from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import chi2_by_information, tail_gate, tail_weight
 from hodge_pipeline.solvers.priors import with_world
 from hodge_pipeline.solvers.weights import PLANAR_AXES, dimension_of, edge_weights
@@ -82,12 +83,18 @@ def _axes(priors: Priors) -> Ints:
 
 
 def left_out_note(graph: ViewGraph, priors: Priors, right: Bools, world_from_cam: Floats) -> str:
-    """How many priors do not count, and the one of these that is farthest from the poses (V, 4, 4)."""
+    """How many priors do not count, and the one of these that is farthest from the poses (V, 4, 4): in
+    degrees where they state no place.
+    """
     out = np.flatnonzero(~right)
+    off = se3.inverse(world_from_cam[priors.vertices[out]]) @ priors.world_from_vertex[out]
+    stated = np.einsum("pii->pi", priors.information[out]) > 0
     shift = priors.world_from_vertex[out, :3, 3] - world_from_cam[priors.vertices[out], :3, 3]
-    far_m = np.linalg.norm(shift * priors.information[out][:, range(3, 6), range(3, 6)].astype(bool), axis=1)
-    name, most = graph.vertex_ids[priors.vertices[out[np.argmax(far_m)]]], far_m.max()
+    far_m = np.linalg.norm(shift * stated[:, 3:], axis=1)
+    turn_deg = np.degrees(np.linalg.norm(se3.log(off)[:, :3], axis=1))
+    row = int(np.argmax(far_m if far_m.any() else turn_deg))
+    how = f"{far_m[row]:.3g} m" if far_m.any() else f"{turn_deg[row]:.3g}°"
     return (
         f"{counted(len(out), 'prior is|priors are')} left out of {len(right)}, since the edges and the other priors "
-        f"contradict them: that of vertex {name} is {most:.3g} m off"
+        f"contradict them: that of vertex {graph.vertex_ids[priors.vertices[out[row]]]} is {how} off"
     )
