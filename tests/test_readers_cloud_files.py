@@ -175,6 +175,7 @@ def test_tables_of_points_are_read(tmp_path: Path, name: str, head: str, separat
         "# a scan\n//X Y Z\n2\n1.5 2.5 3.5\n4.5 5.5 6.5\n",
         "1,5;2,5;3,5\n4,5;5,5;6,5\n",
         "1,5\t2,5\t3,5\n4,5\t5,5\t6,5\n",
+        "15,0e-1 2,5E+00 3,5\n4,5 5,5 6,5\n",
         "x;y;z\n1,5;2,5;3,5\n4,5;5,5;6,5\n",
     ],
 )

@@ -76,7 +76,7 @@ def solve_robust(
         if isinstance(found, Backbone) and not found.chain.stated:
             kept = found.weighted(graph)
         else:
-            kept = graph.select(found.kept if isinstance(found, Diagnosis) else found.used)
+            kept = _informed(graph, found).select(found.kept if isinstance(found, Diagnosis) else found.used)
         right = right_priors(kept, priors, with_priors)
         graph = replace(graph, priors=priors.select(right))
     final = (
@@ -90,11 +90,18 @@ def solve_robust(
     return replace(final, notes=notes, metrics=metrics)
 
 
+def _informed(graph: ViewGraph, found: Backbone | Diagnosis) -> ViewGraph:
+    """The graph without a bias of its steps, or with learned information in the place of the unknown one."""
+    if isinstance(found, Backbone):
+        return found.unbiased(graph)
+    return replace(graph, information=found.information) if has_unit_information(graph) else graph
+
+
 def _on_backbone(graph: ViewGraph, backbone: Backbone, solved: Solver) -> Solution:
     """The poses of a backbone and its confirmed loops: by the information, where it constrains every axis and explains
     the residuals, else by the learned errors; `confirmed` is None where no loop is.
     """
-    chosen = graph.select(np.flatnonzero(backbone.used))
+    chosen = _informed(graph, backbone).select(np.flatnonzero(backbone.used))
     final = solved(chosen, backbone.world_from_cam) if backbone.chain.stated else None
     if final is None or not is_explained(chosen, final):
         final = solved(backbone.weighted(graph), backbone.world_from_cam)
@@ -109,7 +116,7 @@ def _on_backbone(graph: ViewGraph, backbone: Backbone, solved: Solver) -> Soluti
 
 def _without_backbone(graph: ViewGraph, found: Diagnosis, solved: Solver) -> Solution:
     """The poses of the edges that a diagnosis without a backbone keeps."""
-    informed = replace(graph, information=found.information) if has_unit_information(graph) else graph
+    informed = _informed(graph, found)
     stated = edge_weights(graph, dimension_of(graph))
     kept = found.kept & stated.used
 

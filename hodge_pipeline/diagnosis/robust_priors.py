@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
+from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import chi2_by_information, tail_gate, tail_weight
 from hodge_pipeline.solvers.priors import with_world
+from hodge_pipeline.solvers.weights import PLANAR_AXES, dimension_of, edge_weights
 from hodge_pipeline.types import Bools, Floats, Ints, Priors, ViewGraph
 from hodge_pipeline.types.text import counted
 
@@ -29,6 +31,7 @@ def right_priors(graph: ViewGraph, priors: Priors, solved: Callable[[ViewGraph],
 
     `solved` gives the poses (V, 4, 4) of a graph with its priors. Priors may err more than they state, as all do alike.
     """
+    priors = as_solved(graph, priors)
     axes = _axes(priors)
     every, weights = np.ones(len(axes), bool), np.ones(len(axes))
     gate, middle = np.zeros((2, len(axes)))
@@ -46,7 +49,20 @@ def right_priors(graph: ViewGraph, priors: Priors, solved: Callable[[ViewGraph],
         if np.abs(weights - before).max() < SETTLED:
             break
     right = scaled <= gate
-    return right if (~right).sum() < MOST_WRONG * len(right) else every
+    return right if (~right).sum() < MOST_WRONG * (axes > 0).sum() else every
+
+
+def as_solved(graph: ViewGraph, priors: Priors) -> Priors:
+    """The priors with the information that a solve heeds: of a planar graph that in the plane, of others none that
+    lacks axes of both rotation and translation.
+    """
+    whole, _ = with_world(graph, priors, None, None)
+    of_priors, dimension = whole.select(np.arange(graph.edge_count, whole.edge_count)), dimension_of(graph)
+    axes = PLANAR_AXES if dimension == 2 else np.arange(6)
+    heeded = np.ix_(edge_weights(of_priors, dimension).used, axes, axes)
+    information = np.zeros(of_priors.information.shape)
+    information[heeded] = of_priors.information[heeded]
+    return replace(priors, information=information)
 
 
 def chi2_of_priors(graph: ViewGraph, priors: Priors, world_from_cam: Floats) -> Floats:
@@ -57,6 +73,7 @@ def chi2_of_priors(graph: ViewGraph, priors: Priors, world_from_cam: Floats) -> 
 
 def excess_of_priors(graph: ViewGraph, priors: Priors, world_from_cam: Floats) -> float:
     """By how many times what they state priors are off, √(mean χ² of an axis)."""
+    priors = as_solved(graph, priors)
     return float(np.sqrt(chi2_of_priors(graph, priors, world_from_cam).sum() / max(_axes(priors).sum(), 1)))
 
 
@@ -66,12 +83,18 @@ def _axes(priors: Priors) -> Ints:
 
 
 def left_out_note(graph: ViewGraph, priors: Priors, right: Bools, world_from_cam: Floats) -> str:
-    """How many priors do not count, and the one of these that is farthest from the poses (V, 4, 4)."""
+    """How many priors do not count, and the one of these that is farthest from the poses (V, 4, 4): in
+    degrees where they state no place.
+    """
     out = np.flatnonzero(~right)
+    off = se3.inverse(world_from_cam[priors.vertices[out]]) @ priors.world_from_vertex[out]
+    stated = np.einsum("pii->pi", priors.information[out]) > 0
     shift = priors.world_from_vertex[out, :3, 3] - world_from_cam[priors.vertices[out], :3, 3]
-    far_m = np.linalg.norm(shift * priors.information[out][:, range(3, 6), range(3, 6)].astype(bool), axis=1)
-    name, most = graph.vertex_ids[priors.vertices[out[np.argmax(far_m)]]], far_m.max()
+    far_m = np.linalg.norm(shift * stated[:, 3:], axis=1)
+    turn_deg = np.degrees(np.linalg.norm(se3.log(off)[:, :3], axis=1))
+    row = int(np.argmax(far_m if far_m.any() else turn_deg))
+    how = f"{far_m[row]:.3g} m" if far_m.any() else f"{turn_deg[row]:.3g}°"
     return (
         f"{counted(len(out), 'prior is|priors are')} left out of {len(right)}, since the edges and the other priors "
-        f"contradict them: that of vertex {name} is {most:.3g} m off"
+        f"contradict them: that of vertex {graph.vertex_ids[priors.vertices[out[row]]]} is {how} off"
     )

@@ -17,8 +17,9 @@ from hodge_pipeline.types.input_files import open_input
 
 SEPARATORS, DECIMAL_COMMAS = bytes.maketrans(b",;", b"  "), bytes.maketrans(b",;", b". ")
 """Between numbers, where a comma is one; where there are semicolons, it is none."""
-DECIMAL_ROW = re.compile(r"\s*[-+]?\d+(,\d+)?(\s+[-+]?\d+(,\d+)?){2,}\s*")
-"""Numbers between blanks that have a comma each at most, such as `1,5 -2,25 3`: as decimal point."""
+_DECIMAL = r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?"
+DECIMAL_ROW = re.compile(rf"\s*{_DECIMAL}(\s+{_DECIMAL}){{2,}}\s*")
+"""Numbers between blanks that have a comma each at most, such as `1,5 -2,25e-1 3`: as decimal point."""
 COMMENTS = (b"#", b"//")
 
 

@@ -65,7 +65,8 @@ def infer_bridged(
     if first is None:
         return None
     found = judged(chain, first)
-    unbiased = without_bias(chain, first.scales)
+    unbiased = without_bias(chain.parted(), first.scales)  # bridges between paths lead as biased steps do
+    unbiased = None if unbiased is None else joined(unbiased)
     second = None if unbiased is None else judge(unbiased)
     if unbiased is None or second is None:
         return found

@@ -86,7 +86,7 @@ class Backbone:
             spans = self.chain.spans(graph.edges[self.steps])
             times = np.median(self.chain.over(spans)[self.chain.step_edge >= 0])
             width[self.steps] *= np.sqrt(times * np.diff(spans, axis=1))
-        graph, _ = credible_steps(graph, self.steps)
+        graph, _ = credible_steps(self.unbiased(graph), self.steps)
         width[self.chain.loop_edge] = loop * self.loop_width[:, None]
         whole = np.ones((graph.edge_count, 6))
         whole[:, self.chain.axes] = width
@@ -95,18 +95,17 @@ class Backbone:
             rows = np.arange(graph.edge_count)[:, None, None]
             axes = rows, self.chain.axes[:, None], self.chain.axes
             information[axes] = inverse(self.chain.of_both_ends(graph.i_from_j, inverse(information[axes])))
-        motions = self._without_bias(graph)
-        return replace(graph, i_from_j=motions, information=information).select(np.flatnonzero(self.used))
+        return replace(graph, information=information).select(np.flatnonzero(self.used))
 
-    def _without_bias(self, graph: ViewGraph) -> Floats:
-        """The motions (E, 4, 4) of the graph's edges, those of steps without the bias that the chain lacks."""
+    def unbiased(self, graph: ViewGraph) -> ViewGraph:
+        """The graph with the motions of steps without the bias that the chain lacks."""
         if not self.chain.bias.any():
-            return graph.i_from_j
+            return graph
         raw, edges = self.chain.turned(self.chain.bias).poses, np.argsort(self.chain.order)[graph.edges[self.steps]]
         before, after = (se3.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]] for poses in (raw, self.chain.poses))
         motions = graph.i_from_j.copy()
         motions[self.steps] = motions[self.steps] @ se3.inverse(before) @ after
-        return motions
+        return replace(graph, i_from_j=motions)
 
     def places(self, edges: Bools) -> int:
         """How many pairs of places these edges (E,) join; see `Chain.places`."""

@@ -88,7 +88,7 @@ def find_start(scene: Frames, options: GlobalStart, scratch: Path, workers: Work
     pieces = unfolded(clouds, pieces, given, views, options.diagnosis, options.limits.room_m)
     notes += [*pieces.notes, *describe_components(pieces.piece, scene.vertex_ids)]
     advance(len(scene.frames))
-    in_one_frame = _are_scans(scene, by_image) and count_from_one_zero(hypotheses, options.limits.room_m)
+    in_one_frame = views is _no_view
     lay = laid_at_first if in_one_frame else partial(laid_apart, clouds=clouds)
     poses = lay(pieces.piece, pieces.poses)
     told = (
