@@ -65,10 +65,12 @@ def infer_bridged(
     if first is None:
         return None
     found = judged(chain, first)
-    unbiased = without_bias(chain.parted(), first.scales)  # bridges between paths lead as biased steps do
-    unbiased = None if unbiased is None else joined(unbiased)
-    second = None if unbiased is None else judge(unbiased)
-    if unbiased is None or second is None:
+    parted = without_bias(chain.parted(), first.scales)  # bridges between paths lead as biased steps do
+    if parted is None:
+        return found
+    unbiased = joined(parted)
+    second = judge(unbiased)
+    if second is None:
         return found
     other = judged(unbiased, second)
     least = found[1].of_places + BY_CHANCE * len(unbiased.bias) if found[1].confirmed else -np.inf
