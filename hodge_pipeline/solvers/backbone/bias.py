@@ -90,8 +90,8 @@ class _Cycles:
         )
 
     def surely(self) -> Floats:
-        """The bias (r,) of the cycles that agree with the likeliest proposal, along the axes on which they are likelier
-        with it, by errors of one of `FACTORS`; zeros where that may be chance.
+        """The bias (r,) of cycles that agree with the likeliest proposal, where errors of one of `FACTORS` make them
+        likelier with it by more than chance; else zeros.
         """
         proposed = self._proposed()
         factor = self._factor(proposed)
@@ -108,9 +108,7 @@ class _Cycles:
         return bias if likeliest > max(none for none, *_ in found) + surely else np.zeros(len(bias))
 
     def _likely(self, rows: Ints, near: Floats, times: float) -> tuple[float, float, Floats]:
-        """The log-evidence of no bias and of the likelier one of each axis, near one (r,), by cycles (rows) whose steps
-        err `times` as much; and the bias.
-        """
+        """Log-evidence of no bias and of one near (r,), by cycles (rows) whose steps err `times` as much; the latter."""
         covariance = times**2 * self.shared[np.ix_(rows, rows)] + np.diag(self.own[rows])
         factor = cho_factor(covariance, lower=True)
         turned, left = (
@@ -123,8 +121,7 @@ class _Cycles:
         spread = (LARGE * self.usual_rad) ** 2
         gain = 0.5 * pull**2 * spread / (1 + spread * values) - 0.5 * np.log1p(spread * values)
         none = -0.5 * (left * cho_solve(factor, left)).sum() - left.shape[1] * np.log(np.diag(factor[0])).sum()
-        bias = axes @ np.where(gain > 0, pull * spread / (1 + spread * values), 0.0)
-        return float(none), float(none + np.maximum(gain, 0.0).sum()), np.asarray(bias)
+        return float(none), float(none + gain.sum()), np.asarray(axes @ (pull * spread / (1 + spread * values)))
 
     def _proposed(self) -> Floats:
         """Biases (P, r), zero and those of one cycle each."""
