@@ -108,7 +108,7 @@ class _Cycles:
         return bias if likeliest > max(none for none, *_ in found) + surely else np.zeros(len(bias))
 
     def _likely(self, rows: Ints, near: Floats, times: float) -> tuple[float, float, Floats]:
-        """Log-evidence of no bias and of one near (r,), by cycles (rows) whose steps err `times` as much; the latter."""
+        """Log-evidence of no bias, and of one near (r,), by cycles (rows) whose steps err `times` as much; and it."""
         covariance = times**2 * self.shared[np.ix_(rows, rows)] + np.diag(self.own[rows])
         factor = cho_factor(covariance, lower=True)
         turned, left = (
