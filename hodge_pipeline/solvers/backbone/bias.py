@@ -111,17 +111,17 @@ class _Cycles:
         """Log-evidence of no bias, and of one near (r,), by cycles (rows) whose steps err `times` as much; and it."""
         covariance = times**2 * self.shared[np.ix_(rows, rows)] + np.diag(self.own[rows])
         factor = cho_factor(covariance, lower=True)
-        turned, left = (
-            self.turned[rows],
-            self._left(near[None])[0, rows] + np.einsum("kij,j->ki", self.turned[rows], near),
-        )
+        turned, given = self.turned[rows], self.rotation[rows]
+        left = self._left(near[None])[0, rows] + (turned @ near[:, None])[..., 0]  # with the whole turns that it makes
         weighed = cho_solve(factor, turned.reshape(len(rows), -1)).reshape(turned.shape)
         values, axes = np.linalg.eigh(np.einsum("kij,kil->jl", turned, weighed))
         pull = axes.T @ np.einsum("kij,ki->j", weighed, left)
         spread = (LARGE * self.usual_rad) ** 2
         gain = 0.5 * pull**2 * spread / (1 + spread * values) - 0.5 * np.log1p(spread * values)
-        none = -0.5 * (left * cho_solve(factor, left)).sum() - left.shape[1] * np.log(np.diag(factor[0])).sum()
-        return float(none), float(none + gain.sum()), np.asarray(axes @ (pull * spread / (1 + spread * values)))
+        none, both = (-0.5 * (each * cho_solve(factor, each)).sum() for each in (given, left))
+        half_log_det = given.shape[1] * np.log(np.diag(factor[0])).sum()
+        bias = axes @ (pull * spread / (1 + spread * values))
+        return float(none - half_log_det), float(both - half_log_det + gain.sum()), np.asarray(bias)
 
     def _proposed(self) -> Floats:
         """Biases (P, r), zero and those of one cycle each."""
