@@ -14,10 +14,11 @@ from hodge_pipeline.solvers.backbone.breaks import Break, Runs, agreed_breaks, u
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, optimised
-from hodge_pipeline.solvers.backbone.inference import Inferred, by_chance, infer, refused
+from hodge_pipeline.solvers.backbone.inference import Inferred, by_chance, infer, refused, without
 from hodge_pipeline.solvers.backbone.judge import densities
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
+from hodge_pipeline.solvers.backbone.mistakes import without_shift
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.places import MISTAKEN, MISTAKEN_PLACES, MOST_STEPS, agreeing_groups
 from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
@@ -35,6 +36,10 @@ RobotCar's .39, .48.
 JUDGED_TWICE = 1000
 """Most loops that are judged by stated errors too where learned ones are only a few times as large: a limit on cost.
 RobotCar's 2438 took 1.1 CPU s more, of 1.5.
+"""
+SMALL, OF_A_SHIFT = 0.25, 3 * BY_CHANCE
+"""Factor on the learned errors by which mistaken loops are found, and the nats that a shift which they share must
+gain: for each of its axes more than chance.
 """
 DRAWN = 3
 """Times that the motions of loops are drawn at random."""
@@ -65,6 +70,7 @@ def infer_bridged(
     if first is None:
         return None
     found = judged(chain, first)
+    found = _without_shared_shift(chain, found, judge, outliers, trusted) or found
     parted = without_bias(chain.parted(), first.scales)  # bridges between paths lead as biased steps do
     if parted is None:
         return found
@@ -102,6 +108,31 @@ def _bridged(
         if other.confirmed and not (_contradicted(other) and _random_motions_do_as_well(one, other, trusted, judge)):
             return one, other
     return unbroken, refused(first, trusted)
+
+
+def _without_shared_shift(
+    unbroken: Chain,
+    found: tuple[Chain, Inferred],
+    judge: Callable[..., Inferred | None],
+    outliers: OutlierModel,
+    trusted: Bools,
+) -> tuple[Chain, Inferred] | None:
+    """The loops of a chain without those that take places for others alike, all by one shift of the world, where all
+    are likelier so; else None.
+
+    They bend the path until they fit: places that differ by a shift are all explained by one flight of stairs that is
+    not there. With errors of a quarter they are refused. All loops are then judged without that shift.
+    """
+    if not found[1].confirmed or len(unbroken.ends) > JUDGED_TWICE:
+        return None
+    small = judge(unbroken, scales=found[1].scales.times(SMALL))
+    shared = None if small is None else next(small.mistakes(), None)
+    if small is None or shared is None or shared.nats < OF_A_SHIFT:
+        return None
+    other = judge(without_shift(unbroken, small.linear, shared.rows))
+    if other is None or not other.confirmed or other.of_places < found[1].of_places + OF_A_SHIFT:
+        return None
+    return unbroken, without(other, unbroken, shared.rows, outliers, trusted)
 
 
 def _contradicted(found: Inferred) -> bool:

@@ -102,6 +102,15 @@ def infer(
     return found
 
 
+def without(found: Inferred, chain: Chain, rows: Ints, outliers: OutlierModel, trusted: Bools) -> Inferred:
+    """The result without the loops `rows (K,)`, whose motions are those of `chain`; those of `trusted (M,)` stay."""
+    used = found.used.copy()
+    used[rows] = False
+    trial = _Trial.of(chain, outliers, trusted, True, found.scales, EVEN)
+    linear = replace(found.linear, chain=trial.start.chain)
+    return trial.final(used | trusted, EVEN, linear, found.confirmed and bool(used.any()), found.of_places)
+
+
 def _others_agree(found: Inferred, chain: Chain, outliers: OutlierModel, trusted: Bools) -> bool:
     """Whether by other errors, those of `chain`, other loops than the used ones agree with the poses found; `trusted`
     (M,) are used in any case.

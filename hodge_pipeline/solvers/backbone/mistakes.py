@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import STUDENT_99
+from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis
 from hodge_pipeline.solvers.backbone.judge import by_path
 from hodge_pipeline.solvers.backbone.linear import Linear
@@ -45,3 +47,20 @@ def mistakes(linear: Linear, log_wrong: Floats, used: Bools) -> Iterator[Mistake
         yield Mistake(rows[left & (factor > 0)], max(nats, 0.0), bool(chi2 < STUDENT_99[split]))
         if nats > 0:
             left &= factor <= 0
+
+
+def shifts(linear: Linear, rows: Ints) -> Floats:
+    """How far loops (rows) take the places of their later ends from where the poses have them, (K, 3) in the world's
+    axes.
+    """
+    chain, poses, (i, j) = linear.chain, linear.poses, linear.chain.ends[rows].T
+    return np.asarray((chain.compose(poses[i], chain.motion[rows]) - poses[j])[:, :3, 3])
+
+
+def without_shift(chain: Chain, linear: Linear, rows: Ints) -> Chain:
+    """The chain with loops (rows) that do not have the shift which they share at the poses of `linear`."""
+    poses, motion = linear.poses[chain.ends[rows, 0]], chain.motion.copy()
+    back = np.zeros((len(rows), 4, 4))
+    back[:, :3, 3] = np.median(shifts(linear, rows), axis=0)
+    motion[rows] -= se3.inverse(poses) @ back
+    return replace(chain, motion=motion)

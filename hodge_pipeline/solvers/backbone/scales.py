@@ -75,6 +75,10 @@ class Scales:
         of_steps = np.where(chain.bridged[:, None, None], chain.step_covariance, of_steps)
         return replace(chain, step_covariance=of_steps, covariance=of_loops, unit=False)
 
+    def times(self, factor: float) -> Scales:
+        """All of these scales times a factor."""
+        return Scales(*(factor * each for each in astuple(self)))
+
     @property
     def at_most_stated(self) -> Scales:
         """Those of these scales that are below 1, the others 1."""

@@ -19,6 +19,7 @@ from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE
 from hodge_pipeline.solvers.backbone.inference import Inferred
 from hodge_pipeline.solvers.backbone.linear import Linear, inverse
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
+from hodge_pipeline.solvers.backbone.mistakes import shifts
 from hodge_pipeline.solvers.backbone.parallel import Fused, fused, loops_once
 from hodge_pipeline.solvers.backbone.polish import LOCAL
 from hodge_pipeline.solvers.backbone.sequence import consecutive_edges, linear_forest, sequential_edges, vertex_ranks
@@ -166,12 +167,10 @@ class Backbone:
         found, first = self.found, next(self.found.mistakes(), None)
         if first is None or first.nats < BY_CHANCE:
             return ""
-        chain, poses, rows = found.linear.chain, found.linear.poses, first.rows
-        i, j = chain.ends[rows].T
-        shifts = (chain.compose(poses[i], chain.motion[rows]) - poses[j])[:, :3, 3]
-        usual = np.median(shifts, axis=0)
+        each = shifts(found.linear, first.rows)
+        usual = np.median(each, axis=0)
         far_m = float(np.linalg.norm(usual))
-        alike = int((np.linalg.norm(shifts - usual, axis=1) < SAME_SHIFT * far_m).sum())
+        alike = int((np.linalg.norm(each - usual, axis=1) < SAME_SHIFT * far_m).sum())
         if 2 * alike < (~found.used).sum():
             return ""
         return f"{alike} loops left out agree on a shift of {far_m:.3g} m: places that look alike"
