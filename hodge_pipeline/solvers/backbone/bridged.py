@@ -37,8 +37,8 @@ JUDGED_TWICE = 1000
 """Most loops that are judged by stated errors too where learned ones are only a few times as large: a limit on cost.
 RobotCar's 2438 took 1.1 CPU s more, of 1.5.
 """
-SMALL, OF_A_SHIFT = 0.25, 3 * BY_CHANCE
-"""Factor on the learned errors by which mistaken loops are found, and the nats that a shift which they share must
+SMALLER, OF_A_SHIFT = (1 / 4, 1 / 16), 3 * BY_CHANCE
+"""Factors on the learned errors by which mistaken loops are found, and the nats that a shift which they share must
 gain: for each of its axes more than chance.
 """
 DRAWN = 3
@@ -70,7 +70,8 @@ def infer_bridged(
     if first is None:
         return None
     found = judged(chain, first)
-    found = _without_shared_shift(chain, found, judge, outliers, trusted) or found
+    for factor in SMALLER:
+        found = _without_shared_shift(chain, found, factor, judge, outliers, trusted)
     parted = without_bias(chain.parted(), first.scales)  # bridges between paths lead as biased steps do
     if parted is None:
         return found
@@ -113,25 +114,26 @@ def _bridged(
 def _without_shared_shift(
     unbroken: Chain,
     found: tuple[Chain, Inferred],
+    factor: float,
     judge: Callable[..., Inferred | None],
     outliers: OutlierModel,
     trusted: Bools,
-) -> tuple[Chain, Inferred] | None:
+) -> tuple[Chain, Inferred]:
     """The loops of a chain without those that take places for others alike, all by one shift of the world, where all
-    are likelier so; else None.
+    are likelier so; else what was `found`.
 
     They bend the path until they fit: places that differ by a shift are all explained by one flight of stairs that is
-    not there. With errors of a quarter they are refused. All loops are then judged without that shift.
+    not there. With errors smaller by a `factor` they are refused. All loops are then judged without that shift.
     """
     if not found[1].confirmed or len(unbroken.ends) > JUDGED_TWICE:
-        return None
-    small = judge(unbroken, scales=found[1].scales.times(SMALL))
+        return found
+    small = judge(unbroken, scales=found[1].scales.times(factor))
     shared = None if small is None else next(small.mistakes(), None)
     if small is None or shared is None or shared.nats < OF_A_SHIFT:
-        return None
+        return found
     other = judge(without_shift(unbroken, small.linear, shared.rows))
     if other is None or not other.confirmed or other.of_places < found[1].of_places + OF_A_SHIFT:
-        return None
+        return found
     return unbroken, without(other, unbroken, shared.rows, outliers, trusted)
 
 
