@@ -37,10 +37,8 @@ JUDGED_TWICE = 1000
 """Most loops that are judged by stated errors too where learned ones are only a few times as large: a limit on cost.
 RobotCar's 2438 took 1.1 CPU s more, of 1.5.
 """
-SMALLER, OF_A_SHIFT = (1 / 4, 1 / 16), 3 * BY_CHANCE
-"""Factors on the learned errors by which mistaken loops are found, and the nats that a shift which they share must
-gain: for each of its axes more than chance.
-"""
+SMALLER = 1 / 4, 1 / 16
+"""Factors on the learned errors by which mistaken loops are found."""
 DRAWN = 3
 """Times that the motions of loops are drawn at random."""
 
@@ -129,10 +127,11 @@ def _without_shared_shift(
         return found
     small = judge(unbroken, scales=found[1].scales.times(factor))
     shared = None if small is None else next(small.mistakes(), None)
-    if small is None or shared is None or shared.nats < OF_A_SHIFT:
+    least = by_chance(len(unbroken.ends))
+    if small is None or shared is None or shared.nats < BY_CHANCE:
         return found
     other = judge(without_shift(unbroken, small.linear, shared.rows))
-    if other is None or not other.confirmed or other.of_places < found[1].of_places + OF_A_SHIFT:
+    if other is None or not other.confirmed or other.log_evidence < found[1].log_evidence + least:
         return found
     return unbroken, without(other, unbroken, shared.rows, outliers, trusted)
 
