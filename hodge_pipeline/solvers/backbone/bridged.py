@@ -37,8 +37,10 @@ JUDGED_TWICE = 1000
 """Most loops that are judged by stated errors too where learned ones are only a few times as large: a limit on cost.
 RobotCar's 2438 took 1.1 CPU s more, of 1.5.
 """
-SMALLER = 1 / 4, 1 / 16
-"""Factors on the learned errors by which mistaken loops are found."""
+SMALLER, OF_A_SHIFT = (1 / 4, 1 / 16), 3 * BY_CHANCE
+"""Factors on the learned errors by which mistaken loops are found; and the nats that a shift which they share must
+gain, more than chance for each of its axes.
+"""
 DRAWN = 3
 """Times that the motions of loops are drawn at random."""
 
@@ -125,15 +127,18 @@ def _without_shared_shift(
     """
     if not found[1].confirmed or len(unbroken.ends) > JUDGED_TWICE:
         return found
-    small = judge(unbroken, scales=found[1].scales.times(factor))
+    scales, used = found[1].scales, found[1].used
+    small = judge(unbroken, scales=scales.times(factor))
     shared = None if small is None else next(small.mistakes(), None)
-    least = by_chance(len(unbroken.ends))
-    if small is None or shared is None or shared.nats < BY_CHANCE:
+    if small is None or shared is None or not used[shared.rows].any():
         return found
-    other = judge(without_shift(unbroken, small.linear, shared.rows))
-    if other is None or not other.confirmed or other.log_evidence < found[1].log_evidence + least:
+    apart = without_shift(unbroken, small.linear, shared.rows)
+    same = judge(apart, scales=scales)  # so that nothing but the shift differs
+    if same is None or not same.confirmed or same.of_places < found[1].of_places + OF_A_SHIFT:
         return found
-    return unbroken, without(other, unbroken, shared.rows, outliers, trusted)
+    again = judge(apart)
+    better = same if again is None or again.log_evidence < same.log_evidence else again
+    return unbroken, without(better, unbroken, shared.rows, outliers, trusted)
 
 
 def _contradicted(found: Inferred) -> bool:
