@@ -238,6 +238,23 @@ def test_a_jump_that_leads_back_moves_no_other_pose():
     np.testing.assert_allclose(without_steps(given, refined, jumps), refined, atol=1e-12)
 
 
+def test_a_hundred_jumps_leave_motions_rigid_and_steps_that_are_mostly_jumps_are_another_path(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """Rounding of one jump doubled with the next."""
+    rng = np.random.default_rng(4)
+    true, given = (se3.exp(rng.normal(scale=0.3, size=(200, 6))) for _ in range(2))
+    mended = without_steps(given, true, np.arange(0, 198, 2))
+    np.testing.assert_allclose(np.linalg.det(mended[:, :3, :3]), 1.0, atol=1e-9)
+    steps = [(se3.inverse(poses[:-1]) @ poses[1:])[0:198:2] for poses in (mended, true)]
+    np.testing.assert_allclose(steps[0], steps[1], atol=1e-9)
+    for count, found in ((99, 99), (100, 0)):
+        monkeypatch.setattr("hodge_pipeline.refine.jumps.far_steps", lambda *_, count=count: np.arange(count))
+        work, keys, _ = work_of(given, np.array([0.3, 0.003]), monkeypatch, (0.1, 0.1))
+        rows, *_ = sure_jumps(work, keys, SimpleNamespace(), SimpleNamespace(world_from_cam=true))
+        assert len(rows) == found
+
+
 @pytest.mark.parametrize("knocked", [False, True])
 def test_what_follows_a_turn_keeps_its_steps_or_its_places(knocked: bool):
     """From pose 6 of a path that bends on, all is turned about pose 6 by 5 degrees, or each pose about itself."""

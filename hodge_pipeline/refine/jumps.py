@@ -17,8 +17,8 @@ from hodge_pipeline.types import CloudSet, Floats, Ints, Solution, ViewGraph
 from hodge_pipeline.types.notes import Note
 
 UNLIKE, MOST_JUMPS = 0.5, 3
-"""A step that differs from the refined one by more than half of the longer of the two is no scaled copy of it; jumps
-that a note names.
+"""A step that differs from the refined one by more than half of the longer of the two is no scaled copy of it, and a
+path of which more than half does is another one; jumps that a note names.
 """
 LED_BACK = 0.25
 """Share of what each of two jumps puts a step off, up to which the second takes the first back: of the least jump, 8
@@ -32,10 +32,14 @@ def sure_jumps(
     """The rows of key frames from which the given path jumps to the next, by far more than edges err, see `far_steps`;
     the given poses (K, 4, 4) without these jumps; and how far images, or else clouds, lie off there, before and after.
 
-    Pairs that are held out seldom touch a pose that is far off, since there it overlaps with nothing.
+    None where these are not a minority of the steps: then it is another path. Pairs that are held out seldom touch a
+    pose that is far off, since there it overlaps with nothing.
     """
     before, after = key_frames.world_from_key, solution.world_from_cam
-    rows = far_steps(graph, solution, before, first_of_steps(key_frames), work.recipe.guard.shared_errors)
+    firsts = first_of_steps(key_frames)
+    rows = far_steps(graph, solution, before, firsts, work.recipe.guard.shared_errors)
+    if len(rows) > UNLIKE * len(firsts):
+        return rows[:0], before, []
     off_m = _off_m(work, rows, before, after)
     nearer = off_m[1] < off_m[0]
     if not nearer.any():
@@ -83,11 +87,16 @@ def without_steps(before: Floats, after: Floats, jumps: Ints, arm_m: float = se3
         if left and off_m(k, until) < LED_BACK * min(off_m(k, k + 1), off_m(left[0], until)):
             left.pop(0)
             end = until
-        jump = se3.inverse(out[k + 1]) @ out[k] @ se3.inverse(after[k]) @ after[k + 1]
-        ways = [out[k + 1] @ jump @ se3.inverse(out[k + 1]) @ out[k + 1 : end], out[k + 1 : end] @ jump]
+        moved = _rigid(out[k] @ se3.inverse(after[k]) @ after[k + 1] @ se3.inverse(out[k + 1]))
+        ways = [moved @ out[k + 1 : end], out[k + 1 : end] @ _rigid(se3.inverse(out[k + 1]) @ moved @ out[k + 1])]
         unlike_m = [_unlike_m(poses[: until - k - 1], after[k + 1 : until], arm_m) for poses in ways]
         out[k + 1 : end] = ways[int(np.argmin(unlike_m))]
     return out
+
+
+def _rigid(motion: Floats) -> Floats:
+    """The motion (4, 4) without what rounding adds to its rotation: each jump would double that of the one before."""
+    return se3.from_parts(se3.project_to_so3(motion[:3, :3]), motion[:3, 3])
 
 
 def _unlike_m(poses: Floats, after: Floats, arm_m: float) -> float:
