@@ -14,7 +14,7 @@ import hodge_pipeline
 from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import se3
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
-from hodge_pipeline.refine.against_images import step_errors_m
+from hodge_pipeline.refine.against_images import step_errors
 from hodge_pipeline.stages import Step
 from hodge_pipeline.types import Floats32, Source
 
@@ -37,10 +37,23 @@ def test_images_show_true_steps_and_no_others(room: Source, tmp_path: Path) -> N
     moved[1::2] = moved[1::2] @ se3.exp(np.array([0, 0, 0, 0.03, 0, 0]))
     pairs = np.array([[0, 1], [1, 2], [2, 3]])
     step = Step(tmp_path, lambda done: None, lambda *notes: None)
-    off_m = step_errors_m(room, pairs, np.stack([truth, moved]), 1.0, step=step)
+    off_m = step_errors(room, pairs, np.stack([truth, moved]), 1.0, step=step)[..., 0]
     assert off_m[0].max() < 0.015 < 0.02 < off_m[1].min()
     blind = replace(room, frames=tuple(replace(frame, read_colour=None) for frame in room.frames))
-    assert np.isnan(step_errors_m(blind, pairs, truth[None], 1.0, step=step)).all()
+    assert np.isnan(step_errors(blind, pairs, truth[None], 1.0, step=step)).all()
+
+
+def test_steps_are_seen_however_far_off_the_first_poses_are(room: Source, tmp_path: Path) -> None:
+    """Pose 1 is turned by 60 degrees: corners followed from there are lost."""
+    truth = truth_of(room)
+    lost = truth.copy()
+    lost[1] = lost[1] @ se3.exp(np.array([0, np.pi / 3, 0, 0, 0, 0]))
+    step = Step(tmp_path, lambda done: None, lambda *notes: None)
+    pairs = np.array([[0, 1], [1, 2]])
+    assert np.isnan(step_errors(room, pairs, lost[None], 1.0, step=step)).all()
+    off = step_errors(room, pairs, np.stack([lost, truth]), 1.0, step=step)
+    np.testing.assert_allclose(off[0, :, 1], np.pi / 3, atol=0.02)
+    assert off[1].max() < 0.02
 
 
 def warped(read: Callable[[], Floats32], share: Floats32) -> Floats32:

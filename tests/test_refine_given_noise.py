@@ -10,7 +10,7 @@ import pytest
 from hodge_pipeline import se3
 from hodge_pipeline.evaluation.trajectory import absolute_error
 from hodge_pipeline.refine import given_poses
-from hodge_pipeline.refine.given_noise import without_noise
+from hodge_pipeline.refine.given_noise import far_steps, without_noise
 from hodge_pipeline.refine.guard import Measure
 from hodge_pipeline.refine.uncertainty import reduced_chi2
 from hodge_pipeline.solvers.maximum_likelihood import solve
@@ -94,6 +94,21 @@ def test_a_drift_no_larger_than_the_bend_of_edges_is_kept(
         assert found is given if kept else found is None
 
 
+@pytest.mark.parametrize("twist", [[0, 0.06, 0, 0, 0, 0], [0, 0, 0, 0, 0.06, 0]])
+def test_a_step_that_edges_put_far_off_is_a_jump_also_among_several_and_of_rough_poses(
+    measured: tuple[ViewGraph, Solution], twist: list[float]
+) -> None:
+    """Poses 10, 20, 30 and 40 are 60 mm or mrad off, there and back; the mean of squares takes these for roughness."""
+    jump = se3.exp(np.array(twist, float))
+    for sigma in (0.0, 2e-3):
+        given = rough(sigma)
+        assert not len(far_steps(*measured, given, FIRSTS, SHARED))
+        given[10::10] = given[10::10] @ jump
+        assert sorted(far_steps(*measured, given, FIRSTS, SHARED).tolist()) == [9, 10, 19, 20, 29, 30, 39, 40]
+    some = far_steps(*measured, given, FIRSTS[15:], SHARED)
+    assert sorted(some.tolist()) == [19, 20, 29, 30, 39, 40], "steps within a sequence alone"
+
+
 def test_edges_that_no_cycle_tests_count_as_stated(measured: tuple[ViewGraph, Solution]) -> None:
     graph, solution = measured
     tree = graph.select(np.arange(COUNT - 1))
@@ -139,7 +154,7 @@ def decided(measured: tuple[ViewGraph, Solution], given: Floats, monkeypatch: py
     monkeypatch.setattr(given_poses, "spread_corrections", lambda key_frames, after, jumps: after)
     monkeypatch.setattr(given_poses, "_held_out", lambda work, pairs, key_frames, found: (found, [better], None))
     monkeypatch.setattr(
-        given_poses, "sure_jumps", lambda work, keys, after: (np.zeros(0, np.int64), keys.world_from_key, [])
+        given_poses, "sure_jumps", lambda work, keys, *_: (np.zeros(0, np.int64), keys.world_from_key, [])
     )
     monkeypatch.setattr(given_poses, "held_out_pairs", lambda rounds: [])
     for name in ("against_images", "path_size", "_settled"):

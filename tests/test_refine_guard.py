@@ -138,27 +138,39 @@ def test_a_change_is_told_in_millimetres_and_degrees():
 
 
 def work_of(
-    before: np.ndarray, off_images_m: np.ndarray, monkeypatch: pytest.MonkeyPatch
+    before: np.ndarray, off_images_m: np.ndarray, monkeypatch: pytest.MonkeyPatch, apart_m: tuple[float, float]
 ) -> tuple[SimpleNamespace, KeyFrames, list[Note]]:
     """The work, key frames of these poses and its notes, where images lie off each step, before and after, by this (2,)
-    or (2, K - 1).
+    or (2, K - 1), and clouds from each other by `apart_m`.
     """
     notes: list[Note] = []
     steps = SimpleNamespace(note=lambda *more: notes.extend(more))
     frames = [SimpleNamespace(frame_id=row) for row in range(len(before))]
+    guard = SimpleNamespace(shared_errors=100.0)
     work = SimpleNamespace(
-        recipe=SimpleNamespace(scale=1.0), steps=steps, scene=SimpleNamespace(source=SimpleNamespace(frames=frames))
+        recipe=SimpleNamespace(scale=1.0, guard=guard),
+        steps=steps,
+        scene=SimpleNamespace(source=SimpleNamespace(frames=frames)),
     )
     rows, zeros, ones = np.arange(len(before)), np.zeros(len(before), np.int64), np.ones(len(before), bool)
     keys = KeyFrames(rows, before, before, zeros, rows / 30, ones, rows / 30, zeros, rows)
     off_m = np.broadcast_to(off_images_m.reshape(2, -1), (2, len(before) - 1))
-    monkeypatch.setattr("hodge_pipeline.refine.jumps.off_images_m", lambda work, firsts, *poses: off_m[:, firsts])
+    off = np.stack([off_m, np.where(np.isnan(off_m), np.nan, 0.0)], axis=-1)
+    monkeypatch.setattr("hodge_pipeline.refine.jumps.off_images", lambda work, firsts, *poses: off[:, firsts])
+    apart = np.array(apart_m)[:, None]
+    monkeypatch.setattr("hodge_pipeline.refine.jumps.apart_m", lambda work, pairs, *_: np.tile(apart, len(pairs)))
     return work, keys, notes
 
 
-def sized(before: np.ndarray, after: np.ndarray, off_images_m: np.ndarray, monkeypatch: pytest.MonkeyPatch):
-    """The measures of a path's size, and the notes, where images lie off the steps by this (2,)."""
-    work, keys, notes = work_of(before, off_images_m, monkeypatch)
+def sized(
+    before: np.ndarray,
+    after: np.ndarray,
+    off_images_m: np.ndarray,
+    monkeypatch: pytest.MonkeyPatch,
+    apart_m: tuple[float, float] = (0.1, 0.01),
+):
+    """The measures of a path's size, and the notes, where images lie off the steps by this (2,), clouds by the last."""
+    work, keys, notes = work_of(before, off_images_m, monkeypatch, apart_m)
     return path_size(work, keys, after), notes
 
 
@@ -175,29 +187,38 @@ def test_a_jump_of_the_given_path_is_no_other_scale(monkeypatch: pytest.MonkeyPa
     twice[9:, 0, 3] += 2.0
     measures, notes = sized(twice, true, nothing, monkeypatch)
     assert not measures and "at 2 steps (from frame 8 to 9 by 2.05 m" in str(notes[0])
-    for before, after, images in ((true, jumped, nothing), (jumped, true, np.array([0.0, 1.0]))):
-        measures, notes = sized(before, after, images, monkeypatch)
-        assert measures and notes[0].kind == "path scaled", "a jump of the refined path, or one that images show"
+    near, far = (0.01, 0.1), (0.1, 0.1)
+    for before, after, images, clouds in (
+        (true, jumped, nothing, near),
+        (jumped, true, np.array([0.0, 1.0]), far),
+        (jumped, true, nothing, near),
+        (jumped, true, nothing, far),
+    ):
+        measures, notes = sized(before, after, images, monkeypatch, clouds)
+        assert measures and notes[0].kind == "path scaled", "a jump of the refined path, or one that they show"
     measures, notes = sized(se3.rescaled(true, 1.3), true, nothing, monkeypatch)
     assert measures and notes[0].kind == "path scaled" and notes[0].detail == "0.769"
 
 
-def test_a_pose_that_images_put_elsewhere_is_a_sure_jump_there_and_back(monkeypatch: pytest.MonkeyPatch):
+def test_a_pose_that_edges_and_images_put_elsewhere_is_a_sure_jump_there_and_back(monkeypatch: pytest.MonkeyPatch):
     """Pose 5 of twelve lies 30 cm beside the path; images err by 3 mm. Steps back in place, the rest is as it was."""
     true = se3.from_parts(np.broadcast_to(np.eye(3), (12, 3, 3)), np.outer(np.arange(12), [0.05, 0, 0]))
     given = true.copy()
     given[5, 1, 3] += 0.3
+    graph, solution = SimpleNamespace(), SimpleNamespace(world_from_cam=true)
     off_m = np.full((2, 11), 0.003)
-    off_m[0, [4, 5]] = 0.3
-    work, keys, _ = work_of(given, off_m, monkeypatch)
-    rows, mended, (measure,) = sure_jumps(work, keys, true)
-    assert sorted(rows.tolist()) == [4, 5] and measure.is_better and str(measure).endswith("300 → 3 mm")
-    np.testing.assert_allclose(mended, true, atol=1e-12)
-    for before, after in ((0.03, 0.003), (0.3, 0.2), (np.nan, np.nan)):  # as true steps err, both off, no images
-        off_m[:, [4, 5]] = np.array([[before], [after]])
-        work, keys, _ = work_of(given, off_m, monkeypatch)
-        rows, mended, measures = sure_jumps(work, keys, true)
-        assert not len(rows) and not measures and mended is given
+    monkeypatch.setattr("hodge_pipeline.refine.jumps.far_steps", lambda *_: np.array([5, 4]))
+    for images, clouds in (((0.3, 0.003), (0.0, 1.0)), ((np.nan, np.nan), (0.3, 0.003))):
+        off_m[:, [4, 5]] = np.array([images]).T
+        work, keys, _ = work_of(given, off_m, monkeypatch, clouds)
+        rows, mended, (measure,) = sure_jumps(work, keys, graph, solution)
+        assert sorted(rows.tolist()) == [4, 5] and measure.is_better and str(measure).endswith("300 → 3 mm")
+        np.testing.assert_allclose(mended, true, atol=1e-12)
+    for images, clouds in (((0.003, 0.3), (1.0, 0.0)), ((np.nan, np.nan), (0.1, 0.1))):
+        off_m[:, [4, 5]] = np.array([images]).T
+        work, keys, _ = work_of(given, off_m, monkeypatch, clouds)
+        rows, mended, measures = sure_jumps(work, keys, graph, solution)
+        assert not len(rows) and not measures and mended is given, "images, or without them clouds, show the given step"
 
 
 def test_a_jump_that_leads_back_moves_no_other_pose():
@@ -207,14 +228,43 @@ def test_a_jump_that_leads_back_moves_no_other_pose():
     refined[5:, 1, 3] += 0.01
     given, jumps = true.copy(), np.array([5, 4])
     given[5, 1, 3] += 0.3
-    mended = without_steps(given, refined, jumps, near_m=0.03)
+    mended = without_steps(given, refined, jumps)
     np.testing.assert_allclose(np.delete(mended, 5, axis=0), np.delete(true, 5, axis=0), atol=1e-12)
     np.testing.assert_allclose(mended[5], refined[5], atol=1e-12)
     turned = given.copy()
     turned[6:] = given[6] @ se3.exp(np.array([0, 0, 0.2, 0, 0, 0])) @ se3.inverse(given[6]) @ given[6:]
-    np.testing.assert_allclose(without_steps(turned, refined, jumps, near_m=0.03), refined, atol=1e-12)
+    np.testing.assert_allclose(without_steps(turned, refined, jumps), refined, atol=1e-12)
     given[6:, 1, 3] += 0.2
-    np.testing.assert_allclose(without_steps(given, refined, jumps, near_m=0.03), refined, atol=1e-12)
+    np.testing.assert_allclose(without_steps(given, refined, jumps), refined, atol=1e-12)
+
+
+def test_a_hundred_jumps_leave_motions_rigid_and_steps_that_are_mostly_jumps_are_another_path(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """Rounding of one jump doubled with the next."""
+    rng = np.random.default_rng(4)
+    true, given = (se3.exp(rng.normal(scale=0.3, size=(200, 6))) for _ in range(2))
+    mended = without_steps(given, true, np.arange(0, 198, 2))
+    np.testing.assert_allclose(np.linalg.det(mended[:, :3, :3]), 1.0, atol=1e-9)
+    steps = [(se3.inverse(poses[:-1]) @ poses[1:])[0:198:2] for poses in (mended, true)]
+    np.testing.assert_allclose(steps[0], steps[1], atol=1e-9)
+    for count, found in ((99, 99), (100, 0)):
+        monkeypatch.setattr("hodge_pipeline.refine.jumps.far_steps", lambda *_, count=count: np.arange(count))
+        work, keys, _ = work_of(given, np.array([0.3, 0.003]), monkeypatch, (0.1, 0.1))
+        rows, *_ = sure_jumps(work, keys, SimpleNamespace(), SimpleNamespace(world_from_cam=true))
+        assert len(rows) == found
+
+
+@pytest.mark.parametrize("knocked", [False, True])
+def test_what_follows_a_turn_keeps_its_steps_or_its_places(knocked: bool):
+    """From pose 6 of a path that bends on, all is turned about pose 6 by 5 degrees, or each pose about itself."""
+    steps = se3.exp(np.tile([0.0, 0.03, 0.0, 0.05, 0.0, 0.0], (12, 1)))
+    true = np.array([np.linalg.multi_dot([np.eye(4), np.eye(4), *steps[:k]]) for k in range(12)])
+    turn = se3.exp(np.array([0, 0, np.deg2rad(5), 0, 0, 0]))
+    given = true.copy()
+    given[6:] = true[6:] @ turn if knocked else true[6] @ turn @ se3.inverse(true[6]) @ true[6:]
+    np.testing.assert_allclose(without_steps(given, true, np.array([5])), true, atol=1e-12)
+    assert np.abs(given - true)[6:, :3, 3].max() == pytest.approx(0.0) or not knocked
 
 
 def test_the_widest_correction_still_takes_jumps_out():

@@ -38,22 +38,22 @@ def first_of_steps(key_frames: KeyFrames) -> Ints:
     return np.flatnonzero(sequence[1:] == sequence[:-1])
 
 
-def off_images_m(work: Work, firsts: Ints, before: Floats, after: Floats) -> Floats:
-    """How far (2, S) the steps from these key frames to the next, before and after, lie from those that images show;
-    NaN where there are none.
+def off_images(work: Work, firsts: Ints, before: Floats, after: Floats) -> Floats:
+    """How far (2, S, 2) the steps from these key frames to the next, before and after, lie from those that images show,
+    metres and radians; NaN where there are none.
     """
     source, scale = work.scene.source, float(work.recipe.scale)
     if not len(firsts) or not all(frame.read_colour and frame.read_depth for frame in source.frames):
-        return np.full((2, len(firsts)), np.nan)
+        return np.full((2, len(firsts), 2), np.nan)
     pairs, poses = np.column_stack([firsts, firsts + 1]), np.stack([before, after])
-    return work.steps.step(step_errors_m, source, pairs, poses, scale, title="guard: images", total=len(pairs))
+    return work.steps.step(step_errors, source, pairs, poses, scale, title="guard: images", total=len(pairs))
 
 
 def against_images(work: Work, key_frames: KeyFrames, after: Floats) -> list[Measure]:
     """How far steps from key frame to key frame lie from those of optical flow; empty without images or depth."""
     firsts, scale = first_of_steps(key_frames), float(work.recipe.scale)
     firsts = firsts[evenly(len(firsts), MOST_STEPS)]
-    off_m = off_images_m(work, firsts, key_frames.world_from_key, after)
+    off_m = off_images(work, firsts, key_frames.world_from_key, after)[..., 0]
     before_mm, after_mm = off_m[:, np.isfinite(off_m).all(axis=0)] * 1000
     if len(before_mm) < FEWEST_STEPS:
         return []
@@ -65,23 +65,32 @@ def against_images(work: Work, key_frames: KeyFrames, after: Floats) -> list[Mea
     return [Measure("steps off those of images", *mean, tolerance=tolerance_mm, unit="mm")]
 
 
-def step_errors_m(source: Source, pairs: Ints, pose_sets: Floats, unit_m: float, *, step: Step) -> Floats:
-    """Step: how far (S, P) steps between pairs (P, 2) of frames, under sets of poses (S, K, 4, 4), lie from those that
-    images show.
+def step_errors(source: Source, pairs: Ints, pose_sets: Floats, unit_m: float, *, step: Step) -> Floats:
+    """Step: how far (S, P, 2) steps between pairs (P, 2) of frames, under sets of poses (S, K, 4, 4), lie from those
+    that images show, metres and radians.
 
-    NaN where a pair has no readable images, or too few of its corners agree on a motion. `unit_m`: the recipe's scale.
+    NaN where a pair has no readable images, or too few of its corners agree on a motion, whichever set they are
+    followed from: one that is 30 cm off may lose them. `unit_m`: the recipe's scale.
     """
-    off_m = np.full((len(pose_sets), len(pairs)), np.nan)
+    off = np.full((len(pose_sets), len(pairs), 2), np.nan)
     images: dict[int, FlowImage | None] = {}
     for column, (i, j) in enumerate(pairs.tolist()):
         images = {row: images[row] if row in images else _read(source.frames[row], unit_m) for row in (i, j)}
         one, other = images[i], images[j]
         i_from_j = se3.inverse(pose_sets[:, i]) @ pose_sets[:, j]
-        found = None if one is None or other is None else follow(find_corners(one), other, i_from_j[0])
-        if found is not None:
-            off_m[:, column] = np.linalg.norm((se3.inverse(found.key_from_view) @ i_from_j)[:, :3, 3], axis=1)
+        if one is not None and other is not None:
+            corners = find_corners(one)
+            found = next(filter(None, (follow(corners, other, motion) for motion in i_from_j)), None)
+            if found is not None:
+                off[:, column] = step_difference(found.key_from_view, i_from_j)
         step.advance(1)
-    return off_m
+    return off
+
+
+def step_difference(one: Floats, other: Floats) -> Floats:
+    """How far (..., 2) motions (..., 4, 4) lie from each other, metres and radians."""
+    between = se3.inverse(one) @ other
+    return np.stack([np.linalg.norm(between[..., :3, 3], axis=-1), se3.rotation_angle(between)], axis=-1)
 
 
 def _read(frame: Frame, unit_m: float) -> FlowImage | None:

@@ -32,6 +32,12 @@ times as far as any pair is by chance, as at a jump. True poses reach 0.3 to 1.1
 2.0 in real recordings (red kitchen): so far edges may be off, and from 3.5 on the squared error of the given poses is
 twice that of edges. The farthest pair alone, 1.6 times as far as by chance, called edges nearer wrongly twice as often.
 """
+JUMP = 1.75
+"""Times as far as any step is by chance from which a given one is a jump. True steps reach 0.3 in rendered rooms, 0.5
+in fr1/xyz, 1.0 in fr1/rpy and 1.4 in red kitchen; there a pose 30 cm off reaches 6 to 11, a turn of 5 degrees 5.5.
+"""
+MEDIAN_OF_THREE = float(chdtri(3, 0.5))
+"""The median of the sum of three squares of a standard normal."""
 PLACES = 16
 """Pairs of each distance, evenly along the path."""
 LEAST = 1e-6
@@ -67,6 +73,23 @@ def without_noise(
     return solve(edges, start=given, initial="given", priors=priors).world_from_cam
 
 
+def far_steps(graph: ViewGraph, solution: Solution, given: Floats, firsts: Ints, shared_errors: float) -> Ints:
+    """The rows from which given poses (K, 4, 4) jump to the next, of `firsts (S,)`: by `JUMP` times as far as edges and
+    white noise make any step err by chance, the farthest first. None where a singular graph tells no covariance.
+    """
+    edges = _weakened(graph, solution, shared_errors)
+    component = connected_components(edges.edges, edges.vertex_count)
+    firsts = firsts[component[firsts] == component[firsts + 1]]
+    pairs = np.stack([firsts, firsts + 1], axis=1)
+    try:
+        covariances = relative_covariances(edges, solution.world_from_cam, pairs)
+    except (GraphError, np.linalg.LinAlgError, RuntimeError):
+        return firsts[:0]
+    chi2 = _chi2(solution, given, pairs, covariances, _white(solution, given, firsts, has_jumps=True))
+    far = np.flatnonzero(chi2 > JUMP**2 * chdtri(6, CHANCE / max(1, len(pairs))))
+    return firsts[far[np.argsort(-chi2[far])]]
+
+
 def _weakened(graph: ViewGraph, solution: Solution, shared_errors: float) -> ViewGraph:
     """The edges used, with the information that they have with the errors that they share."""
     used, reduced = np.flatnonzero(solution.kept), reduced_chi2(graph, solution)
@@ -90,8 +113,8 @@ def _corrections(solution: Solution, given: Floats, pairs: Ints) -> Floats:
     return se3.log(se3.between(given, pairs[:, ::-1]) @ se3.between(solution.world_from_cam, pairs))
 
 
-def _white(solution: Solution, given: Floats, firsts: Ints) -> Floats:
-    """The variances (2,) of rotations and translations that each pose has on its own.
+def _white(solution: Solution, given: Floats, firsts: Ints, *, has_jumps: bool = False) -> Floats:
+    """The variances (2,) of rotations and translations that each pose has on its own; medians where it `has_jumps`.
 
     What white noise adds to a step the next one takes back: two steps are off by no more than one. By a random walk
     they are off by twice its variance, by a bend more.
@@ -99,11 +122,14 @@ def _white(solution: Solution, given: Floats, firsts: Ints) -> Floats:
     twice = firsts[:-1][np.diff(firsts) == 1]
     if not len(twice):
         return np.zeros(2)
-    one, two = (
-        (_corrections(solution, given, np.stack([starts, starts + apart], axis=1)) ** 2).mean(axis=0)
+    of_one, of_two = (
+        (_corrections(solution, given, np.stack([starts, starts + apart], axis=1)) ** 2).reshape(-1, 2, 3).sum(axis=2)
         for starts, apart in ((firsts, 1), (twice, 2))
     )
-    return np.asarray(np.maximum((one - two / 2).reshape(2, 3).mean(axis=1), 0.0))
+    one, two = (
+        np.median(of, axis=0) / MEDIAN_OF_THREE if has_jumps else of.mean(axis=0) / 3 for of in (of_one, of_two)
+    )
+    return np.asarray(np.maximum(one - two / 2, 0.0))
 
 
 def _white_at_most(of_steps: Floats) -> Floats:

@@ -13,21 +13,20 @@ from hodge_pipeline import registry, se3
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.errors import RecipeError
 from hodge_pipeline.evaluation.difference import length
-from hodge_pipeline.evaluation.scores import SIGMA_M, edge_distances
+from hodge_pipeline.evaluation.scores import SIGMA_M
 from hodge_pipeline.pairs.held_out import held_out_pairs
 from hodge_pipeline.refine.against_images import against_images, first_of_steps
 from hodge_pipeline.refine.conventions import explained
 from hodge_pipeline.refine.given_noise import without_noise
 from hodge_pipeline.refine.guard import SCORE_TOLERANCE, Decision, Measure, decide, mean_noise
-from hodge_pipeline.refine.jumps import jump_note, sure_jumps
+from hodge_pipeline.refine.jumps import apart_m, jump_note, sure_jumps
 from hodge_pipeline.refine.path_size import path_size
 from hodge_pipeline.refine.uncertainty import mean_chi2, pose_change
 from hodge_pipeline.rounds.one_round import Work
 from hodge_pipeline.rounds.settling import last_shift_m, settled_m
 from hodge_pipeline.scene import KeyFrames, Round
 from hodge_pipeline.sources.inspect import guesses
-from hodge_pipeline.stages import Step, Workers
-from hodge_pipeline.types import CloudSet, Floats, Ints, Source, Trajectory
+from hodge_pipeline.types import Floats, Ints, Source, Trajectory
 from hodge_pipeline.types.notes import Note
 from hodge_pipeline.types.text import counted, suiting
 
@@ -76,7 +75,7 @@ def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
     nothing = _nothing(last)
     if nothing or last.solution is None:
         return Decision("nothing", nothing), before
-    jumps, mended, off_images = sure_jumps(work, key_frames, last.world_from_cam)
+    jumps, mended, off_there = sure_jumps(work, key_frames, last.graph, last.solution)
     smoothed = without_noise(
         last.graph, last.solution, mended, first_of_steps(key_frames), work.recipe.guard.shared_errors
     )
@@ -90,7 +89,7 @@ def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
     if convention:
         return Decision("forced", convention, decision.measures, moved), after
     if len(jumps) and (decision.outcome == "optimal" or (decision.outcome == "refined" and smoothed is mended)):
-        return _without_jumps(work, rounds, key_frames, mended, jumps, off_images)
+        return _without_jumps(work, rounds, key_frames, mended, jumps, off_there)
     work.steps.note(held_out)
     if decision.outcome == "refined" and smoothed is mended:
         return Decision("optimal", KEPT, decision.measures, moved), after
@@ -105,7 +104,7 @@ def _decision(work: Work, rounds: Sequence[Round], key_frames: KeyFrames) -> tup
 
 
 def _without_jumps(
-    work: Work, rounds: Sequence[Round], key_frames: KeyFrames, after: Floats, jumps: Ints, off_images: list[Measure]
+    work: Work, rounds: Sequence[Round], key_frames: KeyFrames, after: Floats, jumps: Ints, off_there: list[Measure]
 ) -> tuple[Decision, Floats]:
     """The decision on the given poses less their jumps (K, 4, 4), where nothing else of them is to be bettered."""
     last, before = rounds[-1], key_frames.world_from_key
@@ -114,7 +113,7 @@ def _without_jumps(
     work.steps.note(held_out)
     chi2 = [mean_chi2(last.graph, last.solution.weights, poses) for poses in (before, after)]
     moved = pose_change(last.graph, replace(last.solution, world_from_cam=after), before)
-    decision = decide([*off_images, *measures, chi2_measure(*chi2)], moved, force=work.recipe.guard.force)
+    decision = decide([*off_there, *measures, chi2_measure(*chi2)], moved, force=work.recipe.guard.force)
     if decision.outcome == "refined":
         work.steps.note(jump_note(work, before, after, jumps))
     return decision, after
@@ -187,9 +186,7 @@ def _held_out(work: Work, pairs: Ints, key_frames: KeyFrames, found: Floats) -> 
         return found[-1], [], Note("nothing held out", 0)
     scale = float(work.recipe.scale)
     poses = np.stack([key_frames.world_from_key, *found])
-    distances = work.steps.step(
-        held_out_distances_m, work.scene.clouds, pairs, poses, scale, title="guard", workers=work.workers
-    )
+    distances = apart_m(work, pairs, poses, "guard")
     scores = np.exp(-distances / (scale * SIGMA_M))
     row = 1 + first_as_good(scores[1:])
     scores, distances = scores[[0, row]], distances[[0, row]]
@@ -218,13 +215,6 @@ def first_as_good(scores: Floats) -> int:
     losses = scores[scores.mean(axis=1).argmax()] - scores
     noise = np.maximum(losses.std(axis=1) / np.sqrt(scores.shape[1]), SCORE_TOLERANCE)
     return int(np.flatnonzero(losses.mean(axis=1) <= noise)[0])
-
-
-def held_out_distances_m(
-    clouds: CloudSet, pairs: Ints, pose_sets: Floats, scale: float, *, workers: Workers, step: Step
-) -> Floats:
-    """Step: cloud distances (S, P) of the pairs (P, 2) under S sets of poses (S, K, 4, 4), metres."""
-    return edge_distances(clouds.folder, pairs, pose_sets, workers, scale=scale)
 
 
 def _write(work: Work, folder: Path, decision: Decision, after: Floats) -> Path | None:
