@@ -19,6 +19,9 @@ TOLD_BY = {
     "one lap a storey, 30% wrong, 0.02 m a step, stated × 1.0": 3.0,  # the shared mistake: 14 were kept, 1.3 m off
     "rows, 50% wrong, 0.02 m a step, stated × 0.5": 1.5,  # likewise 64, 1.2 m
     "rows, 50% wrong, 0.02 m a step, stated × 1.0": 1.5,  # errors learned twice as large: all 58 were kept
+    "storeys, 50% wrong, 0.02 m a step, stated × 1.0": 3.0,  # the path bent by one flight of stairs: all 66, 1.4 m
+    "deck, 70% wrong, 0.02 m a step, stated × 3.0": 3.0,  # likewise 49 of 70, and half of the right ones lost, 3.3 m
+    "storeys, 70% wrong, 0.02 m a step, stated × 3.0": 3.0,  # by a 16th of learned errors alone: all 172, 3.3 m
     "storeys, 30% wrong, 0.005 m a step, stated × 1.0, a loop a step": 3.0,  # its cycles outvoted the backbone
 }
 
