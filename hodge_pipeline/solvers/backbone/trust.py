@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import expit
 
 from hodge_pipeline import se3
@@ -22,6 +24,7 @@ from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.parallel import Fused, fused, loops_once
 from hodge_pipeline.solvers.backbone.polish import LOCAL
 from hodge_pipeline.solvers.backbone.sequence import consecutive_edges, linear_forest, sequential_edges, vertex_ranks
+from hodge_pipeline.solvers.backbone.step_lengths import misstated_lengths
 from hodge_pipeline.solvers.backbone.step_tests import LOOPS_AT_A_STEP, agreeing_loops, is_tested
 from hodge_pipeline.solvers.backbone.window import windowed
 from hodge_pipeline.solvers.maximum_likelihood import solve
@@ -60,7 +63,7 @@ class Backbone:
     - `world_from_cam (V, 4, 4)`: each path begins at the identity where no loop ties it.
     - `doubted`: whether many loops agree with each other and not with the backbone, or it is broken at several steps,
       so that the backbone itself may be wrong.
-    - `named`: what notes call its edges.
+    - `named`: what notes call its edges; `vertex_ids (V,)`.
     """
 
     chain: Chain
@@ -74,6 +77,7 @@ class Backbone:
     contradicted: Bools
     world_from_cam: Floats
     doubted: bool
+    vertex_ids: NDArray[Any]
     named: str = "consecutive edges"
 
     def weighted(self, graph: ViewGraph) -> ViewGraph:
@@ -137,10 +141,25 @@ class Backbone:
 
     @cached_property
     def findings(self) -> tuple[str, ...]:
-        """What is wrong with many edges at once: the bias of steps, and a shift that unused loops share."""
+        """What is wrong with many edges at once: the bias of steps, a wrong length that they share, and a shift that
+        unused loops share.
+        """
         turn_deg = np.degrees(np.linalg.norm(self.chain.bias))
         biased = f"{self.named} turn {turn_deg:.2g}° too far each, which is taken out" if turn_deg else ""
-        return tuple(each for each in (biased, self._shared_mistake) if each)
+        return tuple(each for each in (biased, *self._wrong_lengths, self._shared_mistake) if each)
+
+    @property
+    def _wrong_lengths(self) -> tuple[str, ...]:
+        """Which steps are too long or too short against the loops, and by how many times."""
+        found, told = self.found, []
+        if not found.confirmed:
+            return ()
+        for each in misstated_lengths(found.start.chain, found.linear.poses, np.flatnonzero(found.used)):
+            ids = np.sort(self.vertex_ids[found.start.chain.order[each.of]])
+            which = "" if each.of_all else f" of vertices {ids[0]} to {ids[-1]}"
+            times, how = (each.factor, "long") if each.factor > 1 else (1 / each.factor, "short")
+            told.append(f"{self.named}{which} are {times:.2f} times too {how} against the loops, which is left so")
+        return tuple(told)
 
     @property
     def _trusted(self) -> str:
@@ -288,7 +307,7 @@ def _backbone(
     poses = np.empty((graph.vertex_count, 4, 4))
     poses[chain.order] = solved[0].poses
     none = np.zeros_like(used)
-    return Backbone(chain, found, steps, used, right, chi2, solved[1], none, none, poses, doubted)
+    return Backbone(chain, found, steps, used, right, chi2, solved[1], none, none, poses, doubted, graph.vertex_ids)
 
 
 def _of_all_edges(graph: ViewGraph, backbone: Backbone, one: Fused) -> Backbone:
