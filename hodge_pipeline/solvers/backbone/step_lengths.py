@@ -17,16 +17,21 @@ from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.types import Bools, Floats, Ints
 
 LEAST_NAMED = float(np.log(1.07))
-"""Logarithm of the least factor that is named: in w20000, whose errors alone lengthen paths, it is 1.05 beyond doubt."""
+"""Logarithm of the least factor that is named: it is 1.05 in w20000, whose errors lengthen its paths."""
 TOLD = 0.1
 """Largest standard deviation of the logarithm of a factor that is named. Loops of almost one place, as all of
 Bicocca's, make a path the likelier the shorter it is: its factor is 1.5 to 2.3, to .19 to .5, those of ten others of
 the literature to .004 to .1, of 100 simulated ones to .09 but for a few.
 """
+AGREE = 3.0
+"""Standard deviations by which all loops together may tell another factor. Where loops or their errors are mistaken
+they tell one that differs by 3.5 to 6.
+"""
 SPREAD = 0.5
 """Prior standard deviation of a factor, for one that loops do not tell."""
-ROUNDS, MOST_STEPS = 5, 20
-"""Refits of a factor, of which three settle one of 1.3, and Gauss–Newton steps of each: limits on cost."""
+ROUNDS, MOST_STEPS, SETTLED = 5, 20, 1e-3
+"""Refits of a factor, and Gauss–Newton steps of each: limits on cost; and the change of its logarithm that ends them.
+"""
 
 
 @dataclass(frozen=True)
@@ -43,24 +48,30 @@ def misstated_lengths(fitted: Chain, poses: Floats, used: Ints) -> list[StepLeng
     (n, 4, 4)`: solved ones.
 
     A factor has to make the residuals of one loop of each place smaller than chance does, by whatever errors: those
-    that were learned with a wrong length explain it.
+    that were learned with a wrong length explain it. All loops together have to tell the same factor.
     """
     measured = fitted.inner & ~fitted.bridged
     path = np.cumsum(fitted.step_edge < 0) - 1
     alone = [measured & (path == number) for number in np.unique(path[measured])]
     groups = [measured, *alone] if len(alone) > 1 else [measured]
-    used = used[one_of_each_place(fitted.places[used])] if len(used) else used
-    reduced = thinned(fitted, used)
-    freedom = len(fitted.axes) * (len(reduced.active) - len(np.unique(path[fitted.ends[reduced.active]])) + 1)
-    fit, found = optimised(Fit(reduced, linearise(fitted, poses)), MOST_STEPS), []
+    if not len(used):
+        return []
+    places = thinned(fitted, used[one_of_each_place(fitted.places[used])])
+    freedom = len(fitted.axes) * (len(places.active) - len(np.unique(path[fitted.ends[places.active]])) + 1)
+    found: list[StepLength] = []
+    fit = optimised(Fit(places, linearise(fitted, poses)), MOST_STEPS)
     while freedom > len(groups) and len(found) < len(alone):
         best = max(groups, key=lambda of: _gain(fit, of))
         other, factor = _refitted(fit, best)
         usual = max(other.cost, np.finfo(float).tiny) / freedom
         gain = 0.5 * freedom * np.log(fit.cost / (freedom * usual))
-        if gain < BY_CHANCE + np.log(len(groups)) or _score(other, best)[1] < usual / TOLD**2:
+        sigma = np.sqrt(usual / _score(other, best)[1])
+        if gain < BY_CHANCE + np.log(len(groups)) or sigma > TOLD:
             break
-        found.append(StepLength(best, factor, best is measured))
+        _, more = _refitted(Fit(thinned(fitted, used), other.linear), best)
+        if abs(np.log(more)) > AGREE * sigma:
+            break
+        found.append(StepLength(best, factor * more, best is measured))
         fit = other
     return [each for each in found if abs(np.log(each.factor)) > LEAST_NAMED]
 
@@ -76,6 +87,8 @@ def _refitted(fit: Fit, of: Bools) -> tuple[Fit, float]:
         step[of, :3, 3] *= np.exp(change)
         linear = linearise(replace(chain, step=step), fit.linear.poses)
         fit = optimised(replace(fit, linear=linear), MOST_STEPS)
+        if abs(change) < SETTLED:
+            break
     return fit, float(np.exp(-log_length))
 
 

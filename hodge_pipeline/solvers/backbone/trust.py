@@ -158,7 +158,8 @@ class Backbone:
             ids = np.sort(self.vertex_ids[found.start.chain.order[each.of]])
             which = "" if each.of_all else f" of vertices {ids[0]} to {ids[-1]}"
             times, how = (each.factor, "long") if each.factor > 1 else (1 / each.factor, "short")
-            told.append(f"{self.named}{which} are {times:.2f} times too {how} against the loops, which is left so")
+            what = f"{self.named}{which} are {times:.2f} times too {how} against the loops"
+            told.append(f"{what}, which is left so: check their scale")
         return tuple(told)
 
     @property
