@@ -23,7 +23,14 @@ from hodge_pipeline.solvers.backbone.linear import Linear, inverse
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.parallel import Fused, fused, loops_once
 from hodge_pipeline.solvers.backbone.polish import LOCAL
-from hodge_pipeline.solvers.backbone.sequence import consecutive_edges, linear_forest, sequential_edges, vertex_ranks
+from hodge_pipeline.solvers.backbone.sequence import (
+    COVERED,
+    consecutive_edges,
+    linear_forest,
+    numbered_along_path,
+    sequential_edges,
+    vertex_ranks,
+)
 from hodge_pipeline.solvers.backbone.step_lengths import misstated_lengths
 from hodge_pipeline.solvers.backbone.step_tests import LOOPS_AT_A_STEP, agreeing_loops, is_tested
 from hodge_pipeline.solvers.backbone.window import windowed
@@ -37,8 +44,6 @@ FEWEST_STEPS, MOST_PATHS = 10, 10
 """Of a backbone that `auto` looks for: its paths have on average at least this many steps times the number of paths, up
 to this many, since loops must join them: one path 10 steps, ten paths or more 100 each.
 """
-COVERED = 0.9
-"""Share of the number of vertices that consecutive edges must reach, so that a sequence is a backbone."""
 AGREEING_REFUSED = 0.05
 """Loops per step that the backbone refuses though they agree with each other, beyond which the backbone is in doubt,
 where loops are many: see `lattice_backbone`.
@@ -218,7 +223,8 @@ def find_backbone(
     """
     if trust == NONE or not graph.edge_count:
         return None
-    graph = replace(graph, dimension=2 if moves_in_plane(graph) else 3)
+    ids, graph = graph.vertex_ids, replace(graph, dimension=2 if moves_in_plane(graph) else 3)
+    graph = numbered_along_path(graph) if trust in (AUTO, SEQUENTIAL) else graph
     chosen = consecutive_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
     repeats = chosen.copy()
     if trust not in (AUTO, SEQUENTIAL):  # repeats of edges outside its paths are loops, as these edges are
@@ -232,7 +238,7 @@ def find_backbone(
     if backbone is None:
         return None
     named = backbone.named if trust in (AUTO, SEQUENTIAL) else f"edges of {trust}"
-    return _of_all_edges(graph, replace(backbone, named=named), single)
+    return _of_all_edges(graph, replace(backbone, named=named, vertex_ids=ids), single)
 
 
 def _of_single_steps(
