@@ -60,7 +60,7 @@ def numbered_along_path(graph: ViewGraph) -> ViewGraph:
         else:
             path[new] = path[old]
             along.append(new)
-    if count - len(paths) < COVERED * count:
+    if sum(map(len, paths)) - len(paths) < COVERED * count:
         return graph
     numbers = np.empty(count, np.int64)
     order = [vertex for each in paths for vertex in each] + [row for row in range(count) if path[row] < 0]
