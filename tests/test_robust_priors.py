@@ -11,6 +11,7 @@ import pytest
 from backbone_graphs import Drive, drive
 from hodge_adapters.pose_graphs.g2o import write_g2o
 from hodge_pipeline import se3
+from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.refine.pose_graph import SolveOptions, solve_file
 from hodge_pipeline.types import Floats, Priors
@@ -59,7 +60,9 @@ def test_what_no_solve_heeds_of_a_fix_contradicts_nothing() -> None:
     assert made.priors is not None
     flat = replace(made.priors, information=made.priors.information * np.diag([0, 0, 0, 1, 1, 0]))
     found = solve_robust(replace(made, priors=flat))
-    assert found.metrics["priors_excess"] == 0 and any("ignored" in note for note in found.notes)
+    assert found.metrics["priors_excess"] == 0 and any(note.startswith("40 priors not used") for note in found.notes)
+    assert not any("ignored" in note or "pieces" in note for note in found.notes)
+    assert any(note.startswith("40 priors not used") for note in diagnose(replace(made, priors=flat)).notes)
     plain = drive(dimension=2, world="town", seed=2, wrong=0.3, loops=60)
     raised = with_fixes(plain, none + [0, 0, 100.0]).graph
     assert raised.priors is not None
@@ -108,3 +111,20 @@ def test_a_path_of_steps_and_fixes_with_a_slip_is_solved() -> None:
     found = solve_robust(slipped)
     assert (found.weights > 0).all()
     assert made.error_m(found.world_from_cam) < 0.5 * made.error_m(replace(made, graph=slipped).odometry())
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_diagnosis_tells_priors_that_contradict_the_edges(dimension: int) -> None:
+    """It said nothing of priors."""
+    made = drive(dimension=dimension, world="town", seed=2, wrong=0.3, loops=60)
+    spoilt, good = (diagnose(with_fixes(made, far_off(40, share)).graph) for share in (0.2, 0.0))
+    assert spoilt.findings[-1].startswith("8 of 40 priors contradict the edges and the others: that of vertex")
+    assert any(note.startswith("40 priors are off by") for note in good.notes)
+    assert not any("prior" in finding for finding in good.findings)
+
+
+def test_a_diagnosis_tells_priors_that_err_more_than_they_state() -> None:
+    made = drive(wrong=0.3, loops=60)
+    off = np.random.default_rng(1).normal(0, 20 * FIX_M, (40, 3)) * [1, 1, 0]
+    found = diagnose(with_fixes(made, off).graph)
+    assert found.findings[-1].startswith("40 priors are off by") and "times what they state" in found.findings[-1]

@@ -9,7 +9,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.checks import check_graph
-from hodge_pipeline.complex.chi2 import in_vertex_order
+from hodge_pipeline.complex.chi2 import has_unit_information, in_vertex_order
 from hodge_pipeline.complex.closing import cycle_errors
 from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.complex.short_cycles import with_cycles_of
@@ -27,6 +27,7 @@ from hodge_pipeline.diagnosis.result import (
     Diagnosis,
 )
 from hodge_pipeline.diagnosis.robust_poses import Solved
+from hodge_pipeline.diagnosis.robust_priors import priors_told
 from hodge_pipeline.diagnosis.shared_blame import share_blame
 from hodge_pipeline.diagnosis.wording import reasons
 from hodge_pipeline.one_blas_thread import one_blas_thread
@@ -55,7 +56,25 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     """
     check_graph(graph)
     found = backbone_or_diagnosis(graph, options)
-    return found if isinstance(found, Diagnosis) else judged_on_backbone(graph, found)
+    judged = found if isinstance(found, Diagnosis) else judged_on_backbone(graph, found)
+    if graph.priors is None:
+        return judged
+    notes, findings = priors_told(graph, kept_graph(graph, found))
+    return replace(judged, notes=(*judged.notes, *notes), findings=(*judged.findings, *findings))
+
+
+def informed(graph: ViewGraph, found: Backbone | Diagnosis) -> ViewGraph:
+    """The graph without a bias of its steps, or with learned information in the place of the unknown one."""
+    if isinstance(found, Backbone):
+        return found.unbiased(graph)
+    return replace(graph, information=found.information) if has_unit_information(graph) else graph
+
+
+def kept_graph(graph: ViewGraph, found: Backbone | Diagnosis) -> ViewGraph:
+    """The graph of the edges that count, as they are solved beside priors."""
+    if isinstance(found, Diagnosis):
+        return informed(graph, found).select(found.kept)
+    return informed(graph, found).select(found.used) if found.chain.stated else found.weighted(graph)
 
 
 def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbone | Diagnosis:

@@ -17,7 +17,7 @@ from hodge_pipeline.complex.chi2 import has_unit_information
 from hodge_pipeline.complex.closing import closes_better_than_chance
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.cycles import is_folded
-from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, backbone_or_diagnosis
+from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, backbone_or_diagnosis, informed, kept_graph
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.robust_priors import excess_of_priors, left_out_note, right_priors
@@ -73,11 +73,7 @@ def solve_robust(
 
     priors, right = graph.priors, np.ones(0, bool)
     if priors is not None and len(priors.vertices):
-        if isinstance(found, Backbone) and not found.chain.stated:
-            kept = found.weighted(graph)
-        else:
-            kept = _informed(graph, found).select(found.kept if isinstance(found, Diagnosis) else found.used)
-        right = right_priors(kept, priors, with_priors)
+        right = right_priors(kept_graph(graph, found), priors, with_priors)
         graph = replace(graph, priors=priors.select(right))
     final = (
         _without_backbone(graph, found, solved) if isinstance(found, Diagnosis) else _on_backbone(graph, found, solved)
@@ -90,18 +86,11 @@ def solve_robust(
     return replace(final, notes=notes, metrics=metrics)
 
 
-def _informed(graph: ViewGraph, found: Backbone | Diagnosis) -> ViewGraph:
-    """The graph without a bias of its steps, or with learned information in the place of the unknown one."""
-    if isinstance(found, Backbone):
-        return found.unbiased(graph)
-    return replace(graph, information=found.information) if has_unit_information(graph) else graph
-
-
 def _on_backbone(graph: ViewGraph, backbone: Backbone, solved: Solver) -> Solution:
     """The poses of a backbone and its confirmed loops: by the information, where it constrains every axis and explains
     the residuals, else by the learned errors; `confirmed` is None where no loop is.
     """
-    chosen = _informed(graph, backbone).select(np.flatnonzero(backbone.used))
+    chosen = informed(graph, backbone).select(np.flatnonzero(backbone.used))
     final = solved(chosen, backbone.world_from_cam) if backbone.chain.stated else None
     if final is None or not is_explained(chosen, final):
         final = solved(backbone.weighted(graph), backbone.world_from_cam)
@@ -116,19 +105,19 @@ def _on_backbone(graph: ViewGraph, backbone: Backbone, solved: Solver) -> Soluti
 
 def _without_backbone(graph: ViewGraph, found: Diagnosis, solved: Solver) -> Solution:
     """The poses of the edges that a diagnosis without a backbone keeps."""
-    informed = _informed(graph, found)
+    by_learned = informed(graph, found)
     stated = edge_weights(graph, dimension_of(graph))
     kept = found.kept & stated.used
 
     def solved_with(weights: Floats, poses: Floats) -> Solution:
         rows = np.flatnonzero(weights)
-        chosen = informed.select(rows)
+        chosen = by_learned.select(rows)
         return solved(replace(chosen, information=weights[rows, None, None] * chosen.information), poses)
 
     weights = kept.astype(float)
     final = solved_with(weights, found.world_from_cam)
     if not is_explained(graph.select(np.flatnonzero(kept)), final):
-        weights, final = reweighted(informed, weights, final, solved_with)
+        weights, final = reweighted(by_learned, weights, final, solved_with)
     whole = np.zeros(graph.edge_count)
     whole[np.flatnonzero(weights)] = final.weights * weights[np.flatnonzero(weights)]
     earlier = (*stated.notes, _kept_note(found, whole), *found.notes)

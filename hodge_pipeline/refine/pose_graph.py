@@ -17,6 +17,7 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.conventions import inverted_notes
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import degrees_of_freedom, solve_robust
+from hodge_pipeline.diagnosis.robust_priors import MOST_EXCESS
 from hodge_pipeline.errors import GraphError, SourceError, WorkspaceError
 from hodge_pipeline.pairs.edits import joining
 from hodge_pipeline.recipe.recipe_file import recipe_names
@@ -42,10 +43,6 @@ OBJECTIVES = {"full": "chi2", "isotropic": "F"}
 SESYNC_UNITS = np.array([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 """SE-Sync reads g2o's information of the quaternion's vector part, half an angle, as that of the angle."""
 UNTOLD = "the odometry states no errors of some axes: --robust learns them from the loops, which may be far better"
-MOST_EXCESS = 3.0
-"""Edges may be off by so many times what they state: by at most 1.0 times in twenty graphs of the literature and of
-SLAM without wrong edges or with few, by 8 and 11 times in Bicocca's with most of its wrong loops.
-"""
 MOST_POSES_FILMED = 20_000
 """Above it the recording shows the start and the end of the solve only."""
 

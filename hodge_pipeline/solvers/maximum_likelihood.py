@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as stage
 
 from hodge_pipeline.complex.checks import NO_EDGES, check_fixed
-from hodge_pipeline.complex.components import describe_components
+from hodge_pipeline.complex.components import by_size, describe_components
 from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.one_blas_thread import one_blas_thread
@@ -73,7 +73,11 @@ def solve(
         (whole, start), fixed = with_world(graph, priors, start, fixed), None
     rows, unheld = held_rows(whole, start, fixed)
     setup = prepare(whole, start, rows, dimension, direct=certificate)
-    notes = [*unheld, *setup.weights.notes, *describe_components(setup.component, whole.vertex_ids)]
+    notes = [
+        *unheld,
+        *setup.weights.notes,
+        *describe_components(by_size(setup.component[: graph.vertex_count]), graph.vertex_ids),
+    ]
     if not setup.weights.used.any():
         notes.append(NO_EDGES)
     full = objective == "full" and setup.weights.definite

@@ -12,6 +12,8 @@ from hodge_pipeline.complex.components import by_size
 from hodge_pipeline.errors import GraphError
 from hodge_pipeline.types import Floats, Ints, Priors, Solution, ViewGraph
 
+SOURCE = "prior"
+"""The `source` of the edges from the world."""
 PER_EDGE = ("edges", "i_from_j", "information", "fitness", "rmse_m", "source", "correspondences")
 """The columns of a graph with one row for each edge."""
 
@@ -35,7 +37,7 @@ def with_world(graph: ViewGraph, priors: Priors, start: Floats | None, fixed: In
         np.column_stack([np.full(len(vertices), count), vertices]),
         priors.world_from_vertex,
         np.asarray(priors.information, float).reshape(-1, 6, 6),
-        "prior",
+        SOURCE,
     )
     held = np.zeros(0, np.int64) if start is None else graph.fixed if fixed is None else np.asarray(fixed, np.int64)
     joined: dict[str, Any] = {name: np.concatenate([getattr(graph, name), getattr(added, name)]) for name in PER_EDGE}

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from hodge_pipeline.solvers.priors import SOURCE
 from hodge_pipeline.types import Bools, Floats, ViewGraph
 from hodge_pipeline.types.text import counted
 
@@ -21,6 +22,11 @@ EARTH_M = 1.2742e7
 """The earth's diameter: a longer edge is a unit or a measurement gone wrong."""
 RESOLVED = float(1 / np.finfo(float).eps)
 """Ratio of weights beyond which the smaller terms of a cost are lost in the rounding of the larger."""
+UNUSED_PRIOR = (
+    "not used: neither all axes of the position nor all of the rotation have information; where the height lacks it, "
+    "state one with a large error"
+)
+"""What is said of priors that no solve can use."""
 FLOOR = 1e-9
 """Weight, relative to the median, of a used edge without information on rotation, or on translation."""
 
@@ -73,10 +79,12 @@ def edge_weights(graph: ViewGraph, dimension: int) -> Weights:
         notes.append(
             f"{counted(int(loops.sum()), 'edge joins|edges join')} a vertex to itself: they say nothing of poses"
         )
-    silent, stated = ~used & ~loops, information.any(axis=(1, 2))
-    for count, what in ((silent & ~stated, "no information"), (silent & stated, "information that is not positive")):
-        if count.any():
-            notes.append(f"{counted(int(count.sum()), 'edge has|edges have')} {what}: ignored")
+    silent, stated, prior = ~used & ~loops, information.any(axis=(1, 2)), graph.source == SOURCE
+    if count := int((silent & prior).sum()):
+        notes.append(f"{counted(count, 'prior')} {UNUSED_PRIOR}")
+    for rows, what in ((silent & ~stated, "no information"), (silent & stated, "information that is not positive")):
+        if count := int((rows & ~prior).sum()):
+            notes.append(f"{counted(count, 'edge has|edges have')} {what}: ignored")
     lengths = np.where(used, np.linalg.norm(graph.i_from_j[:, :3, 3], axis=1), 0.0)
     if (far := int((lengths > EARTH_M).sum())) > 0:
         i, j = graph.vertex_ids[graph.edges[np.argmax(lengths)]]
@@ -94,7 +102,7 @@ def edge_weights(graph: ViewGraph, dimension: int) -> Weights:
             f"the information of rotation and translation, or of edges, differs by a factor of more than "
             f"{RESOLVED:.0e}: rounding hides the smaller, and the poses may not be the best: lower the largest"
         )
-    kappa, tau = _floor(kappa, used, "rotation", notes), _floor(tau, used, "translation", notes)
+    kappa, tau = _floor(kappa, used, prior, "rotation", notes), _floor(tau, used, prior, "translation", notes)
     return Weights(kappa, tau, information, used, not indefinite.any(), tuple(notes))
 
 
@@ -158,14 +166,17 @@ def _all_definite(matrices: Floats) -> bool:
     return True
 
 
-def _floor(weights: Floats, used: Bools, what: str, notes: list[str]) -> Floats:
-    """The weights with the zeros of used edges raised to almost zero, so that every Laplacian is connected."""
+def _floor(weights: Floats, used: Bools, prior: Bools, what: str, notes: list[str]) -> Floats:
+    """The weights with the zeros of used edges raised to almost zero, so that every Laplacian is connected; those that
+    are no `prior (E,)`, which may well state a place alone, are noted.
+    """
     uninformed = used & (weights <= 0)
     if not uninformed.any():
         return weights
     positive = weights[used & (weights > 0)]
-    notes.append(
-        f"{counted(int(uninformed.sum()), 'edge has|edges have')} no definite information on {what}: their "
-        "weight there is almost zero"
-    )
+    if count := int((uninformed & ~prior).sum()):
+        notes.append(
+            f"{counted(count, 'edge has|edges have')} no definite information on {what}: their weight there is almost "
+            "zero"
+        )
     return np.where(uninformed, FLOOR * np.median(positive) if len(positive) else 1.0, weights)

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from hodge_pipeline.types import Bools, Ints, ViewGraph
+
+COVERED = 0.9
+"""Share of the number of vertices that consecutive edges must reach, so that a sequence is a backbone."""
 
 
 def consecutive_edges(graph: ViewGraph) -> Bools:
@@ -29,6 +34,38 @@ def sequential_edges(graph: ViewGraph) -> Bools:
     out, rows = np.zeros(graph.edge_count, bool), np.flatnonzero(consecutive_edges(graph))
     out[rows[np.unique(np.sort(graph.edges[rows], axis=1), axis=0, return_index=True)[1]]] = True
     return out
+
+
+def numbered_along_path(graph: ViewGraph) -> ViewGraph:
+    """The graph with other vertex ids where its own tell no sequence and the order of its edges does: as SLAM writes a
+    graph, each new vertex is reached from the last one of its path, by whatever ids.
+    """
+    count = graph.vertex_count
+    if sequential_edges(graph).sum() >= COVERED * count:
+        return graph
+    path, paths = [-1] * count, list[list[int]]()
+    for a, b in graph.edges.tolist():
+        old, new = (b, a) if path[b] >= 0 else (a, b)
+        if path[new] >= 0 or old == new:
+            continue
+        if path[old] < 0:
+            path[old] = len(paths)
+            paths.append([old])
+        along = paths[path[old]]
+        if len(along) == 2 and along[0] == old:  # its first edge was written the other way round
+            along.reverse()
+        if along[-1] != old:
+            path[new] = len(paths)
+            paths.append([new])
+        else:
+            path[new] = path[old]
+            along.append(new)
+    if sum(map(len, paths)) - len(paths) < COVERED * count:
+        return graph
+    numbers = np.empty(count, np.int64)
+    order = [vertex for each in paths for vertex in each] + [row for row in range(count) if path[row] < 0]
+    numbers[order] = np.arange(count)
+    return replace(graph, vertex_ids=numbers)
 
 
 def linear_forest(edges: Ints, count: int, trusted: Bools) -> Bools:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import expit
 
 from hodge_pipeline import se3
@@ -22,7 +24,15 @@ from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.mistakes import shifts
 from hodge_pipeline.solvers.backbone.parallel import Fused, fused, loops_once
 from hodge_pipeline.solvers.backbone.polish import LOCAL
-from hodge_pipeline.solvers.backbone.sequence import consecutive_edges, linear_forest, sequential_edges, vertex_ranks
+from hodge_pipeline.solvers.backbone.sequence import (
+    COVERED,
+    consecutive_edges,
+    linear_forest,
+    numbered_along_path,
+    sequential_edges,
+    vertex_ranks,
+)
+from hodge_pipeline.solvers.backbone.step_lengths import misstated_lengths
 from hodge_pipeline.solvers.backbone.step_tests import LOOPS_AT_A_STEP, agreeing_loops, is_tested
 from hodge_pipeline.solvers.backbone.window import windowed
 from hodge_pipeline.solvers.maximum_likelihood import solve
@@ -35,8 +45,6 @@ FEWEST_STEPS, MOST_PATHS = 10, 10
 """Of a backbone that `auto` looks for: its paths have on average at least this many steps times the number of paths, up
 to this many, since loops must join them: one path 10 steps, ten paths or more 100 each.
 """
-COVERED = 0.9
-"""Share of the number of vertices that consecutive edges must reach, so that a sequence is a backbone."""
 AGREEING_REFUSED = 0.05
 """Loops per step that the backbone refuses though they agree with each other, beyond which the backbone is in doubt,
 where loops are many: see `lattice_backbone`.
@@ -61,7 +69,7 @@ class Backbone:
     - `world_from_cam (V, 4, 4)`: each path begins at the identity where no loop ties it.
     - `doubted`: whether many loops agree with each other and not with the backbone, or it is broken at several steps,
       so that the backbone itself may be wrong.
-    - `named`: what notes call its edges.
+    - `named`: what notes call its edges; `vertex_ids (V,)`.
     """
 
     chain: Chain
@@ -75,6 +83,7 @@ class Backbone:
     contradicted: Bools
     world_from_cam: Floats
     doubted: bool
+    vertex_ids: NDArray[Any]
     named: str = "consecutive edges"
 
     def weighted(self, graph: ViewGraph) -> ViewGraph:
@@ -138,10 +147,26 @@ class Backbone:
 
     @cached_property
     def findings(self) -> tuple[str, ...]:
-        """What is wrong with many edges at once: the bias of steps, and a shift that unused loops share."""
+        """What is wrong with many edges at once: the bias of steps, a wrong length that they share, and a shift that
+        unused loops share.
+        """
         turn_deg = np.degrees(np.linalg.norm(self.chain.bias))
         biased = f"{self.named} turn {turn_deg:.2g}° too far each, which is taken out" if turn_deg else ""
-        return tuple(each for each in (biased, self._shared_mistake) if each)
+        return tuple(each for each in (biased, *self._wrong_lengths, self._shared_mistake) if each)
+
+    @property
+    def _wrong_lengths(self) -> tuple[str, ...]:
+        """Which steps are too long or too short against the loops, and by how many times."""
+        found, told = self.found, []
+        if not found.confirmed:
+            return ()
+        for each in misstated_lengths(found.start.chain, found.linear.poses, np.flatnonzero(found.used)):
+            ids = np.sort(self.vertex_ids[found.start.chain.order[each.of]])
+            which = "" if each.of_all else f" of vertices {ids[0]} to {ids[-1]}"
+            times, how = (each.factor, "long") if each.factor > 1 else (1 / each.factor, "short")
+            what = f"{self.named}{which} are {times:.2f} times too {how} against the loops"
+            told.append(f"{what}, which is left so: check their scale")
+        return tuple(told)
 
     @property
     def _trusted(self) -> str:
@@ -197,7 +222,8 @@ def find_backbone(
     """
     if trust == NONE or not graph.edge_count:
         return None
-    graph = replace(graph, dimension=2 if moves_in_plane(graph) else 3)
+    ids, graph = graph.vertex_ids, replace(graph, dimension=2 if moves_in_plane(graph) else 3)
+    graph = numbered_along_path(graph) if trust in (AUTO, SEQUENTIAL) else graph
     chosen = consecutive_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
     repeats = chosen.copy()
     if trust not in (AUTO, SEQUENTIAL):  # repeats of edges outside its paths are loops, as these edges are
@@ -211,7 +237,7 @@ def find_backbone(
     if backbone is None:
         return None
     named = backbone.named if trust in (AUTO, SEQUENTIAL) else f"edges of {trust}"
-    return _of_all_edges(graph, replace(backbone, named=named), single)
+    return _of_all_edges(graph, replace(backbone, named=named, vertex_ids=ids), single)
 
 
 def _of_single_steps(
@@ -287,7 +313,7 @@ def _backbone(
     poses = np.empty((graph.vertex_count, 4, 4))
     poses[chain.order] = solved[0].poses
     none = np.zeros_like(used)
-    return Backbone(chain, found, steps, used, right, chi2, solved[1], none, none, poses, doubted)
+    return Backbone(chain, found, steps, used, right, chi2, solved[1], none, none, poses, doubted, graph.vertex_ids)
 
 
 def _of_all_edges(graph: ViewGraph, backbone: Backbone, one: Fused) -> Backbone:
