@@ -130,11 +130,13 @@ def _without_shared_shift(
     scales, used = found[1].scales, found[1].used
     small = judge(unbroken, scales=scales.times(factor))
     shared = None if small is None else next(small.mistakes(), None)
-    if small is None or shared is None or not used[shared.rows].any():
+    if small is None or shared is None or shared.nats < BY_CHANCE or not used[shared.rows].any():
         return found
     apart = without_shift(unbroken, small.linear, shared.rows)
     same = judge(apart, scales=scales)  # so that nothing but the shift differs
-    if same is None or not same.confirmed or same.of_places < found[1].of_places + OF_A_SHIFT:
+    if same is None or not same.confirmed or same.log_evidence < found[1].log_evidence:
+        return found
+    if same.of_places < found[1].of_places + OF_A_SHIFT:
         return found
     again = judge(apart)
     better = same if again is None or again.log_evidence < same.log_evidence else again
