@@ -14,11 +14,11 @@ from hodge_pipeline.solvers.backbone.breaks import Break, Runs, agreed_breaks, u
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, optimised
-from hodge_pipeline.solvers.backbone.inference import Inferred, by_chance, infer, refused, without
+from hodge_pipeline.solvers.backbone.inference import Inferred, by_chance, infer, refused, refused_alike, without
 from hodge_pipeline.solvers.backbone.judge import densities
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
-from hodge_pipeline.solvers.backbone.mistakes import without_shift
+from hodge_pipeline.solvers.backbone.mistakes import shared_shift, without_shift
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.places import MISTAKEN, MISTAKEN_PLACES, MOST_STEPS, agreeing_groups
 from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
@@ -127,12 +127,16 @@ def _without_shared_shift(
     """
     if not found[1].confirmed or len(unbroken.ends) > JUDGED_TWICE:
         return found
-    scales, used = found[1].scales, found[1].used
-    small = judge(unbroken, scales=scales.times(factor))
-    shared = None if small is None else next(small.mistakes(), None)
-    if small is None or shared is None or shared.nats < BY_CHANCE or not used[shared.rows].any():
+    scales, used = found[1].scales, np.flatnonzero(found[1].used)
+    some = unbroken.with_loops(used, unbroken.ends[used])
+    linear, shared = refused_alike(some, outliers, trusted[used], scales.times(factor))
+    if shared is None or shared.nats < BY_CHANCE:
         return found
-    apart = without_shift(unbroken, small.linear, shared.rows)
+    rows = used[shared.rows]
+    shift, alike = shared_shift(unbroken, linear.poses, rows)
+    if 2 * alike < len(rows):
+        return found
+    apart = without_shift(unbroken, linear.poses, rows, shift)
     same = judge(apart, scales=scales)  # so that nothing but the shift differs
     if same is None or not same.confirmed or same.log_evidence < found[1].log_evidence:
         return found
@@ -140,7 +144,7 @@ def _without_shared_shift(
         return found
     again = judge(apart)
     better = same if again is None or again.log_evidence < same.log_evidence else again
-    return unbroken, without(better, unbroken, shared.rows, outliers, trusted)
+    return unbroken, without(better, unbroken, rows, outliers, trusted)
 
 
 def _contradicted(found: Inferred) -> bool:

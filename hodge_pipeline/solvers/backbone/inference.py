@@ -13,7 +13,7 @@ from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, EVEN, OutlierModel, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, from_rotations, optimised, thinned
-from hodge_pipeline.solvers.backbone.judge import Judged, judge
+from hodge_pipeline.solvers.backbone.judge import Judged, densities, judge
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.mistakes import Mistake, mistakes
@@ -100,6 +100,16 @@ def infer(
             break
         found = other
     return found
+
+
+def refused_alike(
+    chain: Chain, outliers: OutlierModel, trusted: Bools, scales: Scales
+) -> tuple[Linear, Mistake | None]:
+    """The poses that the loops lead to which agree by errors of these scales, and a mistake that others share."""
+    trial = _Trial.of(chain, outliers, trusted, True, scales, EVEN)
+    used, rated = trial.grown(trial.standing_out, trial.start, EVEN)
+    log_wrong = densities(rated.linear, np.arange(len(used)), outliers)[1]
+    return rated.linear, next(mistakes(rated.linear, log_wrong, used), None)
 
 
 def without(found: Inferred, chain: Chain, rows: Ints, outliers: OutlierModel, trusted: Bools) -> Inferred:

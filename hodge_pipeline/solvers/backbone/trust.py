@@ -21,7 +21,7 @@ from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE
 from hodge_pipeline.solvers.backbone.inference import Inferred
 from hodge_pipeline.solvers.backbone.linear import Linear, inverse
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
-from hodge_pipeline.solvers.backbone.mistakes import shifts
+from hodge_pipeline.solvers.backbone.mistakes import shared_shift
 from hodge_pipeline.solvers.backbone.parallel import Fused, fused, loops_once
 from hodge_pipeline.solvers.backbone.polish import LOCAL
 from hodge_pipeline.solvers.backbone.sequence import (
@@ -48,10 +48,6 @@ to this many, since loops must join them: one path 10 steps, ten paths or more 1
 AGREEING_REFUSED = 0.05
 """Loops per step that the backbone refuses though they agree with each other, beyond which the backbone is in doubt,
 where loops are many: see `lattice_backbone`.
-"""
-SAME_SHIFT = 0.5
-"""Share of a shift by which loops that agree on it may differ: floors drift by less. Of 47 unused loops of Bicocca that
-one mistake makes likelier some shift by 0.4 m, some by 14.6 m this way and some the other way.
 """
 FEW_BREAKS = 3
 """Breaks of a backbone with many loops at which the search for more ends and the backbone is in doubt."""
@@ -192,13 +188,10 @@ class Backbone:
         found, first = self.found, next(self.found.mistakes(), None)
         if first is None or first.nats < BY_CHANCE:
             return ""
-        each = shifts(found.linear, first.rows)
-        usual = np.median(each, axis=0)
-        far_m = float(np.linalg.norm(usual))
-        alike = int((np.linalg.norm(each - usual, axis=1) < SAME_SHIFT * far_m).sum())
+        shift, alike = shared_shift(found.linear.chain, found.linear.poses, first.rows)
         if 2 * alike < (~found.used).sum():
             return ""
-        return f"{alike} loops left out agree on a shift of {far_m:.3g} m: places that look alike"
+        return f"{alike} loops left out agree on a shift of {np.linalg.norm(shift):.3g} m: places that look alike"
 
 
 def find_backbone(
