@@ -125,9 +125,9 @@ def _without_shared_shift(
     They bend the path until they fit: places that differ by a shift are all explained by one flight of stairs that is
     not there. With errors smaller by a `factor` they are refused. All loops are then judged without that shift.
     """
-    if not found[1].confirmed or len(unbroken.ends) > JUDGED_TWICE:
-        return found
     scales, used = found[1].scales, np.flatnonzero(found[1].used)
+    if not found[1].confirmed or not len(used) or len(unbroken.ends) > JUDGED_TWICE:
+        return found
     some = unbroken.with_loops(used, unbroken.ends[used])
     linear, shared = refused_alike(some, outliers, trusted[used], scales.times(factor))
     if shared is None or shared.nats < BY_CHANCE:

@@ -118,8 +118,7 @@ def without(found: Inferred, chain: Chain, rows: Ints, outliers: OutlierModel, t
     used[rows] = False
     trial = _Trial.of(chain, outliers, trusted, True, found.scales, EVEN)
     linear = replace(found.linear, chain=trial.start.chain)
-    left = trial.final(used | trusted, EVEN, linear, found.confirmed, found.of_places)
-    return replace(left, confirmed=found.confirmed and bool(left.used.any()))
+    return trial.final(used | trusted, EVEN, linear, found.confirmed, found.of_places)
 
 
 def _others_agree(found: Inferred, chain: Chain, outliers: OutlierModel, trusted: Bools) -> bool:
