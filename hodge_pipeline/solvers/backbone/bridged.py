@@ -70,8 +70,7 @@ def infer_bridged(
     if first is None:
         return None
     found = judged(chain, first)
-    for factor in SMALLER:
-        found = _without_shared_shift(chain, found, factor, judge, outliers, trusted)
+    found = _without_shared_shifts(chain, found, judge, outliers, trusted)
     parted = without_bias(chain.parted(), first.scales)  # bridges between paths lead as biased steps do
     if parted is None:
         return found
@@ -111,40 +110,58 @@ def _bridged(
     return unbroken, refused(first, trusted)
 
 
-def _without_shared_shift(
+def _without_shared_shifts(
     unbroken: Chain,
     found: tuple[Chain, Inferred],
-    factor: float,
     judge: Callable[..., Inferred | None],
     outliers: OutlierModel,
     trusted: Bools,
 ) -> tuple[Chain, Inferred]:
-    """The loops of a chain without those that take places for others alike, all by one shift of the world, where all
-    are likelier so; else what was `found`.
+    """The loops of a chain without those that take places for others alike, by shifts of the world that many share,
+    where all are likelier so; else what was `found`.
 
     They bend the path until they fit: places that differ by a shift are all explained by one flight of stairs that is
-    not there. With errors smaller by a `factor` they are refused. All loops are then judged without that shift.
+    not there. With errors smaller by a factor of `SMALLER` they are refused. All loops are then judged without the
+    shift.
     """
-    scales, used = found[1].scales, np.flatnonzero(found[1].used)
-    if not found[1].confirmed or not len(used) or len(unbroken.ends) > JUDGED_TWICE:
-        return found
-    some = unbroken.with_loops(used, unbroken.ends[used])
-    linear, shared = refused_alike(some, outliers, trusted[used], scales.times(factor))
+    apart, best, mistaken = unbroken, found[1], np.zeros(len(unbroken.ends), bool)
+    for factor in SMALLER if len(mistaken) <= JUDGED_TWICE else ():
+        while (better := _without_shift(apart, best, factor, judge, outliers, trusted)) is not None:
+            apart, best, rows = better
+            mistaken[rows] = True
+    return (unbroken, without(best, unbroken, mistaken, outliers, trusted)) if mistaken.any() else found
+
+
+def _without_shift(
+    chain: Chain,
+    found: Inferred,
+    factor: float,
+    judge: Callable[..., Inferred | None],
+    outliers: OutlierModel,
+    trusted: Bools,
+) -> tuple[Chain, Inferred, Ints] | None:
+    """The chain without the shift that loops refused by errors smaller by a factor share, its loops judged, and which
+    these are (rows); None where all loops are not likelier so.
+    """
+    used = np.flatnonzero(found.used)
+    if not found.confirmed or not len(used):
+        return None
+    some = chain.with_loops(used, chain.ends[used])
+    linear, shared = refused_alike(some, outliers, trusted[used], found.scales.times(factor))
     if shared is None or shared.nats < BY_CHANCE:
-        return found
+        return None
     rows = used[shared.rows]
-    shift, alike = shared_shift(unbroken, linear.poses, rows)
+    shift, alike = shared_shift(chain, linear.poses, rows)
     if 2 * alike < len(rows):
-        return found
-    apart = without_shift(unbroken, linear.poses, rows, shift)
-    same = judge(apart, scales=scales)  # so that nothing but the shift differs
-    if same is None or not same.confirmed or same.log_evidence < found[1].log_evidence:
-        return found
-    if same.of_places < found[1].of_places + OF_A_SHIFT:
-        return found
+        return None
+    apart = without_shift(chain, linear.poses, rows, shift)
+    same = judge(apart, scales=found.scales)  # so that nothing but the shift differs
+    if same is None or not same.confirmed or same.log_evidence < found.log_evidence:
+        return None
+    if same.of_places < found.of_places + OF_A_SHIFT:
+        return None
     again = judge(apart)
-    better = same if again is None or again.log_evidence < same.log_evidence else again
-    return unbroken, without(better, unbroken, rows, outliers, trusted)
+    return apart, same if again is None or again.log_evidence < same.log_evidence else again, rows
 
 
 def _contradicted(found: Inferred) -> bool:

@@ -112,13 +112,11 @@ def refused_alike(
     return rated.linear, next(mistakes(rated.linear, log_wrong, used), None)
 
 
-def without(found: Inferred, chain: Chain, rows: Ints, outliers: OutlierModel, trusted: Bools) -> Inferred:
-    """The result without the loops `rows (K,)`, whose motions are those of `chain`; those of `trusted (M,)` stay."""
-    used = found.used.copy()
-    used[rows] = False
+def without(found: Inferred, chain: Chain, out: Bools, outliers: OutlierModel, trusted: Bools) -> Inferred:
+    """The result without the loops `out (M,)`, whose motions are those of `chain`; those of `trusted (M,)` stay."""
     trial = _Trial.of(chain, outliers, trusted, True, found.scales, EVEN)
     linear = replace(found.linear, chain=trial.start.chain)
-    return trial.final(used | trusted, EVEN, linear, found.confirmed, found.of_places)
+    return trial.final(found.used & ~out | trusted, EVEN, linear, found.confirmed, found.of_places)
 
 
 def _others_agree(found: Inferred, chain: Chain, outliers: OutlierModel, trusted: Bools) -> bool:
