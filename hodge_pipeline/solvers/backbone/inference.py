@@ -108,7 +108,7 @@ def without(found: Inferred, chain: Chain, rows: Ints, outliers: OutlierModel, t
     used[rows] = False
     trial = _Trial.of(chain, outliers, trusted, True, found.scales, EVEN)
     linear = replace(found.linear, chain=trial.start.chain)
-    return trial.final(used | trusted, EVEN, linear, found.confirmed and bool(used.any()), found.of_places)
+    return trial.final(used | trusted, EVEN, linear, found.confirmed, found.of_places)
 
 
 def _others_agree(found: Inferred, chain: Chain, outliers: OutlierModel, trusted: Bools) -> bool:
@@ -234,6 +234,7 @@ class _Trial:
         if np.log(shares[0] / shares[1]) < MISTAKEN:
             used &= ~_single_joins(chain, used) | trusted
         linear, reduced = fit.linear if used.any() else start, thinned(chain, np.flatnonzero(used))
+        confirmed = confirmed and bool(used.any())
         return Inferred(used, judged, self.scales, start, linear, reduced, top, confirmed, of_places)
 
     def grown(
