@@ -325,7 +325,7 @@ MOST_GROWN = 30
 def refused(found: Inferred, trusted: Bools) -> Inferred:
     """The result without unconfirmed loops: at the poses of the bare chain, and of the trusted loops (M,)."""
     reduced = thinned(found.start.chain, np.flatnonzero(trusted))
-    return replace(found, used=trusted.copy(), linear=found.start, reduced=reduced)
+    return replace(found, used=trusted.copy(), linear=found.start, reduced=reduced, confirmed=False)
 
 
 BY_CHANCE_EACH_FOLD = 3.0
