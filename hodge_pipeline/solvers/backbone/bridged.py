@@ -143,9 +143,9 @@ def _without_shift(
     """The chain without the shift that loops refused by errors smaller by a factor share, its loops judged, and which
     these are (rows); None where all loops are not likelier so.
     """
-    used = np.flatnonzero(found.used)
-    if not found.confirmed or not len(used):
+    if not found.confirmed:
         return None
+    used = np.flatnonzero(found.used)
     some = chain.with_loops(used, chain.ends[used])
     linear, shared = refused_alike(some, outliers, trusted[used], found.scales.times(factor))
     if shared is None or shared.nats < BY_CHANCE:

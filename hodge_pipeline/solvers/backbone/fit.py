@@ -175,20 +175,34 @@ class Fit:
         """The logarithm of the determinant of the covariance of all active loops' closing errors together."""
         return self.factor.log_det - float(np.linalg.slogdet(self.precision)[1].sum())
 
+    @cached_property
+    def step(self) -> tuple[Floats, float]:
+        """The Gauss–Newton step (R, p) of the ends, each about itself, and the predicted decrease of χ²."""
+        force = self.force(self.precision @ self.residual[..., None])
+        at_ends = self.factor.solve(force)
+        return at_ends[..., 0], float((at_ends * force).sum())
+
+    @cached_property
+    def least_residual(self) -> Floats:
+        """Residuals (S + L, p) after this step, at the minimum of the linearised χ²."""
+        first, second = self.reduced.network.edges.T
+        move = self.step[0][..., None]
+        return np.asarray(self.residual + (move[second] - self.carry @ move[first])[..., 0])
+
     def left_out(self, rows: slice) -> tuple[Floats, Floats]:
         """Leave-one-out residuals `V S⁻¹ r` (K, p) of these edges, at poses solved without each, and their covariances
-        V (K, p, p); S is the covariance of an edge and r its residual with it.
+        V (K, p, p); S is the covariance of an edge and r its least residual: V S⁻¹ makes what `optimised` leaves of the
+        descent up to a million times larger, 0.04 mm of a loop to 90 m.
         """
         own = self.covariance[rows]
         there = _without(own, self.factor.across()[rows])
-        return (there @ np.linalg.solve(own, self.residual[rows, :, None]))[..., 0], there
+        return (there @ np.linalg.solve(own, self.least_residual[rows, :, None]))[..., 0], there
 
     def moves(self) -> tuple[Floats, float]:
         """The Gauss–Newton step (R, p) of the ends, about the world's origin, and the predicted decrease of χ²."""
-        force = self.force(self.precision @ self.residual[..., None])
-        at_ends = self.factor.solve(force)
+        at_ends, won = self.step
         lever = self.linear.chain.lever(self.linear.poses[self.reduced.ends, :3, 3])
-        return _to_origin(lever, at_ends[..., 0]), float((at_ends * force).sum())
+        return _to_origin(lever, at_ends), won
 
     def moved(self, move: Floats) -> Floats:
         """The poses (n, 4, 4) after motions `move (R, 4, 4)` of the ends, however large, from the left: the gap of a

@@ -242,6 +242,7 @@ class _Trial:
         if np.log(shares[0] / shares[1]) < MISTAKEN:
             used &= ~_single_joins(chain, used) | trusted
         linear, reduced = fit.linear if used.any() else start, thinned(chain, np.flatnonzero(used))
+        confirmed = confirmed and bool(used.any())
         return Inferred(used, judged, self.scales, start, linear, reduced, top, confirmed, of_places)
 
     def grown(
@@ -332,7 +333,7 @@ MOST_GROWN = 30
 def refused(found: Inferred, trusted: Bools) -> Inferred:
     """The result without unconfirmed loops: at the poses of the bare chain, and of the trusted loops (M,)."""
     reduced = thinned(found.start.chain, np.flatnonzero(trusted))
-    return replace(found, used=trusted.copy(), linear=found.start, reduced=reduced)
+    return replace(found, used=trusted.copy(), linear=found.start, reduced=reduced, confirmed=False)
 
 
 BY_CHANCE_EACH_FOLD = 3.0
