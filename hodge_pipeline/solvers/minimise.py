@@ -80,7 +80,6 @@ def _minimum(
     """The descent from `begin`, which may end at a saddle; `at_once`: try the full objective first, where `full`."""
     problem = setup.problem  # where steps are by factorisations from the first the isotropic objective is no help
     alone = problem.structure.precondition is None and not cg_first(problem) and steps_are_direct(problem)
-    alone |= at_once and bool(setup.weights.partly.any())  # the isotropic objective takes for measured what is not
     if full and (at_once or alone):
         objective, least_won = full_objective(setup), 0.0 if alone else LEAST_GAIN_RATIO
         found = descend(objective, objective.at(*begin), limits, setup.rounding, watch, least_won=least_won)
