@@ -25,7 +25,7 @@ from hodge_pipeline.solvers.backbone.trust import Backbone
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.reweighted import reweighted
 from hodge_pipeline.solvers.setup import check_choice, held_rows
-from hodge_pipeline.solvers.weights import dimension_of, edge_weights
+from hodge_pipeline.solvers.weights import PLANAR_AXES, dimension_of, edge_weights, measured_axes
 from hodge_pipeline.types import Bools, Floats, Solution, ViewGraph
 from hodge_pipeline.types.text import counted
 
@@ -94,9 +94,11 @@ def _on_backbone(graph: ViewGraph, backbone: Backbone, solved: Solver) -> Soluti
     final = solved(chosen, backbone.world_from_cam) if backbone.chain.stated else None
     if final is None or not is_explained(chosen, final):
         final = solved(backbone.weighted(graph), backbone.world_from_cam)
+    weights = np.zeros(graph.edge_count)
+    weights[backbone.used] = final.weights
     return replace(
         final,
-        weights=backbone.used.astype(float),
+        weights=weights,
         notes=(*backbone.notes, *final.notes),
         metrics={**final.metrics, "tested_edges": float(np.isfinite(backbone.chi2).sum())},
         confirmed=True if backbone.found.confirmed else None,
@@ -137,12 +139,13 @@ def is_explained(graph: ViewGraph, solution: Solution) -> bool:
 
 def degrees_of_freedom(graph: ViewGraph, solution: Solution) -> int:
     """How many more numbers edges and priors state than the poses of their solution have."""
-    axes = 3 if dimension_of(graph) == 2 else 6
+    axes = PLANAR_AXES if dimension_of(graph) == 2 else np.arange(6)
+    stated = int(measured_axes(graph.information[:, axes[:, None], axes]).sum())
     informed = np.zeros(0, np.int64) if graph.priors is None else graph.priors.vertices
     free = np.ones(int(solution.component.max(initial=-1)) + 1, np.int64)  # gauge: one pose of each component
     free[solution.component[informed]] = 0
     held = np.maximum(np.bincount(solution.component[graph.fixed], minlength=len(free)), free).sum()
-    return axes * int(graph.edge_count + len(informed) - graph.vertex_count + held)
+    return stated + len(axes) * int(len(informed) - graph.vertex_count + held)
 
 
 def _placed(graph: ViewGraph, poses: Floats, start: Floats | None) -> Floats:

@@ -92,7 +92,7 @@ class GraphEditor:
         self._history: list[_State] = []
         start = None if solution is None else solution.world_from_cam
         self._fixed, self._unheld = held_rows(graph, start)
-        setup = prepare(graph, start, self._fixed)
+        setup = self._prepared(graph, start)
         self._base = _Base(graph, np.arange(graph.edge_count), setup)
         if solution is None:
             solution = self._solution(self._base, minimise(setup, "chordal", LIMITS, self._full(setup)))
@@ -192,6 +192,12 @@ class GraphEditor:
         self._state = replace(self._state, solution=solution, owed=owed)
         return solution
 
+    def _prepared(self, graph: ViewGraph, start: Floats | None) -> Setup:
+        setup = prepare(graph, start, self._fixed, full=self._objective == "full")
+        if self._full(setup) or not setup.weights.partly.any():
+            return setup
+        return prepare(graph, start, self._fixed, full=False)
+
     def _full(self, setup: Setup) -> bool:
         return self._objective == "full" and setup.weights.definite
 
@@ -222,13 +228,14 @@ class GraphEditor:
         counted = self._state.weights > 0
         left_out = counted.copy()
         left_out[base.rows] = False
-        joining = base.used[counted[base.used]]
+        holding = ~base.setup.weights.partly[base.setup.weights.used]
+        joining = base.used[counted[base.used] & holding]
         component = connected_components(self.graph.edges[joining], self.graph.vertex_count)
         return not left_out.any() and bool(np.array_equal(component, base.setup.component))
 
     def _make_base(self, rows: Ints) -> _Base:
         start = self._state.solution.world_from_cam
-        return _Base(self.graph, rows, prepare(self.graph.select(rows), start, self._fixed))
+        return _Base(self.graph, rows, self._prepared(self.graph.select(rows), start))
 
 
 def settled_nearby(setup: Setup, changed: Ints, limits: Limits, full: bool) -> tuple[Setup, float]:

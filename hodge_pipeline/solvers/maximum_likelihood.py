@@ -72,7 +72,12 @@ def solve(
     if priors is not None and len(priors.vertices):
         (whole, start), fixed = with_world(graph, priors, start, fixed), None
     rows, unheld = held_rows(whole, start, fixed)
-    setup = prepare(whole, start, rows, dimension, direct=certificate)
+    full = objective == "full"
+    setup = prepare(whole, start, rows, dimension, direct=certificate, full=full)
+    if full and not setup.weights.definite:
+        full = False
+        if setup.weights.partly.any():
+            setup = prepare(whole, start, rows, dimension, direct=certificate, full=False)
     notes = [
         *unheld,
         *setup.weights.notes,
@@ -80,7 +85,6 @@ def solve(
     ]
     if not setup.weights.used.any():
         notes.append(NO_EDGES)
-    full = objective == "full" and setup.weights.definite
     if objective == "full" and not full:
         notes.append("the full objective has no minimum with indefinite information: isotropic weights are used")
     history: list[SolverIteration] = []

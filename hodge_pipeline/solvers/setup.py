@@ -77,15 +77,16 @@ def prepare(
     fixed: Ints = NO_ROWS,
     dimension: DimensionName = None,
     direct: bool = False,
+    full: bool = True,
 ) -> Setup:
-    """The set-up of a graph; `direct`: a factorisation will be needed, whatever it costs.
+    """The set-up of a graph; `direct`: a factorisation will be needed, whatever it costs; `full`: see `edge_weights`.
 
     Raises `GraphError` where its numbers cannot be used.
     """
     check_choice("dimension", dimension, DimensionName)
     check_graph(graph, start)
     size = dimension_of(graph) if dimension is None else dimension
-    weights = edge_weights(graph, size)
+    weights = edge_weights(graph, size, full)
     used = graph.edges[weights.used]
     component = connected_components(used, graph.vertex_count)
     gauge = _gauge(component, fixed, start)

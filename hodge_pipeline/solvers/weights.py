@@ -7,8 +7,10 @@ from typing import Literal
 
 import numpy as np
 
+from hodge_pipeline.complex.chi2 import UNMEASURED
+from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.solvers.priors import SOURCE
-from hodge_pipeline.types import Bools, Floats, ViewGraph
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 from hodge_pipeline.types.text import counted
 
 PLANAR_AXES = np.array([2, 3, 4])
@@ -35,13 +37,15 @@ FLOOR = 1e-9
 class Weights:
     """Isotropic weights κ, τ (E,), the full information over (φ, ρ), 3x3 for a planar graph, and what was found.
 
-    `used (E,)`: edges with any information. `definite`: whether every used matrix is positive semi-definite.
+    `used (E,)`: edges that count. `partly (E,)`: those of them that measure neither all axes of the rotation nor all of
+    the translation. `definite`: whether every used matrix is positive semi-definite.
     """
 
     kappa: Floats
     tau: Floats
     information: Floats
     used: Bools
+    partly: Bools
     definite: bool
     notes: tuple[str, ...]
 
@@ -63,8 +67,12 @@ def moves_in_plane(graph: ViewGraph) -> bool:
     return bool(off < PLANAR_TOLERANCE and not graph.information[:, OUT_OF_PLANE[:, None], PLANAR_AXES].any())
 
 
-def edge_weights(graph: ViewGraph, dimension: int) -> Weights:
-    """The weights of each edge: τ = d / tr(Ω_t⁻¹); κ = 3 / (2 tr(Ω_R⁻¹)), or Ω_θ in the plane (SE-Sync, section II)."""
+def edge_weights(graph: ViewGraph, dimension: int, full: bool = True) -> Weights:
+    """The weights of each edge: τ = d / tr(Ω_t⁻¹); κ = 3 / (2 tr(Ω_R⁻¹)), or Ω_θ in the plane (SE-Sync, section II).
+
+    Edges that measure some axes alone count in the `full` objective, where others hold what they do not measure; κ and
+    τ, those of the axes that they measure, then only lead to its minimum.
+    """
     notes: list[str] = []
     information = graph.information
     if dimension == 2:
@@ -74,15 +82,29 @@ def edge_weights(graph: ViewGraph, dimension: int) -> Weights:
     kappa = _mean_precision(information[:, :p, :p]) / (2 if dimension == 3 else 1)
     tau = _mean_precision(information[:, p:, p:])
     loops = graph.edges[:, 0] == graph.edges[:, 1]
-    used = ((kappa > 0) | (tau > 0)) & ~loops
+    used, prior = ((kappa > 0) | (tau > 0)) & ~loops, graph.source == SOURCE
+    some = ~used & ~loops & ~prior
+    if some.any():
+        some[some] = _states_something(information[some])
+    partly = some & _joined(graph, (kappa > 0) & (tau > 0)) if full and some.any() else np.zeros_like(used)
+    if partly.any():
+        used |= partly
+        kappa[partly] = _measured_precision(information[partly, :p, :p]) / (2 if dimension == 3 else 1)
+        tau[partly] = _measured_precision(information[partly, p:, p:])
+        notes.append(f"{counted(int(partly.sum()), 'edge measures|edges measure')} some axes alone, which count")
     if loops.any():
         notes.append(
             f"{counted(int(loops.sum()), 'edge joins|edges join')} a vertex to itself: they say nothing of poses"
         )
-    silent, stated, prior = ~used & ~loops, information.any(axis=(1, 2)), graph.source == SOURCE
+    silent, stated = ~used & ~loops, information.any(axis=(1, 2))
     if count := int((silent & prior).sum()):
         notes.append(f"{counted(count, 'prior')} {UNUSED_PRIOR}")
-    for rows, what in ((silent & ~stated, "no information"), (silent & stated, "information that is not positive")):
+    unheld = "which the full objective takes where other edges that measure all join their vertices"
+    for rows, what in (
+        (silent & ~stated, "no information"),
+        (silent & some, f"information on some axes alone, {unheld}"),
+        (silent & stated & ~some, "information that is not positive"),
+    ):
         if count := int((rows & ~prior).sum()):
             notes.append(f"{counted(count, 'edge has|edges have')} {what}: ignored")
     lengths = np.where(used, np.linalg.norm(graph.i_from_j[:, :3, 3], axis=1), 0.0)
@@ -102,8 +124,39 @@ def edge_weights(graph: ViewGraph, dimension: int) -> Weights:
             f"the information of rotation and translation, or of edges, differs by a factor of more than "
             f"{RESOLVED:.0e}: rounding hides the smaller, and the poses may not be the best: lower the largest"
         )
-    kappa, tau = _floor(kappa, used, prior, "rotation", notes), _floor(tau, used, prior, "translation", notes)
-    return Weights(kappa, tau, information, used, not indefinite.any(), tuple(notes))
+    told = ~prior & ~partly
+    kappa, tau = _floor(kappa, used, told, "rotation", notes), _floor(tau, used, told, "translation", notes)
+    return Weights(kappa, tau, information, used, partly, not indefinite.any(), tuple(notes))
+
+
+def measured_axes(information: Floats) -> Ints:
+    """How many axes (E,) each matrix (E, k, k) has information on."""
+    size = information.shape[-1]
+    if _all_definite(information):
+        return np.full(len(information), size)
+    diagonal = np.einsum("eii->ei", information)
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    values = np.linalg.eigvalsh(information * scale[:, :, None] * scale[:, None, :])
+    return np.asarray((values > UNMEASURED).sum(axis=1), np.int64)
+
+
+def _states_something(information: Floats) -> Bools:
+    """Where (E,) a matrix has positive information on some axis, and is nowhere negative."""
+    return np.asarray((np.einsum("eii->ei", information) > 0).any(axis=1) & ~_indefinite(information))
+
+
+def _joined(graph: ViewGraph, whole: Bools) -> Bools:
+    """Which edges (E,) have ends that a path of `whole (E,)` edges joins, which hold what the edge does not measure."""
+    part = connected_components(graph.edges[whole], graph.vertex_count)
+    return np.asarray(part[graph.edges[:, 0]] == part[graph.edges[:, 1]])
+
+
+def _measured_precision(blocks: Floats) -> Floats:
+    """The harmonic mean (E,) of the eigenvalues that are not zero, 0 where all are."""
+    values = np.linalg.eigvalsh(blocks)
+    known = values > UNMEASURED * np.maximum(values[:, -1:], 0.0)
+    variances = np.where(known, 1 / np.where(known, values, 1.0), 0.0).sum(axis=1)
+    return np.where(variances > 0, known.sum(axis=1) / np.where(variances > 0, variances, 1.0), 0.0)
 
 
 def _symmetric(matrices: Floats) -> Floats:
@@ -166,17 +219,17 @@ def _all_definite(matrices: Floats) -> bool:
     return True
 
 
-def _floor(weights: Floats, used: Bools, prior: Bools, what: str, notes: list[str]) -> Floats:
-    """The weights with the zeros of used edges raised to almost zero, so that every Laplacian is connected; those that
-    are no `prior (E,)`, which may well state a place alone, are noted.
+def _floor(weights: Floats, used: Bools, told: Bools, what: str, notes: list[str]) -> Floats:
+    """The weights with the zeros of used edges raised to almost zero, so that every Laplacian is connected; a note
+    counts those `told (E,)`, which priors are not: they may well state a place alone.
     """
     uninformed = used & (weights <= 0)
     if not uninformed.any():
         return weights
     positive = weights[used & (weights > 0)]
-    if count := int((uninformed & ~prior).sum()):
+    if count := int((uninformed & told).sum()):
         notes.append(
-            f"{counted(count, 'edge has|edges have')} no definite information on {what}: their weight there is almost "
-            "zero"
+            f"{counted(count, 'edge has|edges have')} no definite information on {what}: the full objective takes what "
+            "is stated, the isotropic one almost nothing"
         )
     return np.where(uninformed, FLOOR * np.median(positive) if len(positive) else 1.0, weights)
