@@ -221,7 +221,7 @@ def _better(
     founds = [found] if as_stated is None or not surprising else [found, as_stated]
     for broken, least in [each for one in founds for each in _candidates(chain, one, outliers)]:
         tried = bridged(chain, broken)
-        same = judge(tried, scales=found.scales)  # so that nothing but the step differs
+        same = judge(tried, scales=found.scales, least=found.at_first)  # so that nothing but the step differs
         if same is None or same.log_evidence <= found.log_evidence + least:
             continue
         if broken.usual or same.start.chain.corridors_over(broken.at, np.flatnonzero(same.used)) > 1:

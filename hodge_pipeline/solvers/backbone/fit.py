@@ -170,6 +170,16 @@ class Fit:
         """χ² of the chain and the active loops."""
         return float(np.einsum("mi,mij,mj->", self.residual, self.precision, self.residual))
 
+    @property
+    def torn(self) -> float:
+        """χ² beyond which the active loops contradict each other."""
+        return TORN * len(self.reduced.active) * len(self.linear.chain.axes)
+
+    @property
+    def is_torn(self) -> bool:
+        """Whether the active loops contradict each other."""
+        return self.cost > self.torn
+
     @cached_property
     def log_det(self) -> float:
         """The logarithm of the determinant of the covariance of all active loops' closing errors together."""
@@ -253,10 +263,9 @@ def optimised(fit: Fit, steps: int) -> Fit:
     """The fit after up to `steps` of Gauss–Newton with halving, until the predicted decrease of χ² is below
     `LEAST_WON`, or below `SHARE_WON` of χ² where loops contradict each other.
     """
-    torn = TORN * len(fit.reduced.active) * len(fit.linear.chain.axes)
     for _ in range(steps if len(fit.reduced.active) else 0):
         (moves, won), before = fit.moves(), fit.cost
-        if won < (LEAST_WON if before < torn else SHARE_WON * before):
+        if won < (LEAST_WON if before < fit.torn else SHARE_WON * before):
             break
         for _ in range(HALVINGS):
             with np.errstate(over="ignore", invalid="ignore"):  # far too long a step ends in no number, and is halved

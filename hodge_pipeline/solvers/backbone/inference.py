@@ -39,7 +39,7 @@ class Inferred:
       graph of the used loops, or of those that `thinned` leaves.
     - `log_evidence`: of the loops, against all being wrong; `confirmed`: whether it exceeds that of chance. If not,
       none should be used: see `refused`. `of_places`: the log-odds that all places that were found right are, each of
-      them counting once.
+      them counting once. `at_first`: the log-evidence at poses by the loops that stand out on the bare chain.
     """
 
     used: Bools
@@ -51,6 +51,7 @@ class Inferred:
     log_evidence: float
     confirmed: bool
     of_places: float
+    at_first: float = -np.inf
 
     @property
     def rank(self) -> tuple[bool, float]:
@@ -73,19 +74,25 @@ class Inferred:
 
 
 def infer(
-    chain: Chain, outliers: OutlierModel, trusted: Bools, may_thin: bool, scales: Scales | None = None
+    chain: Chain,
+    outliers: OutlierModel,
+    trusted: Bools,
+    may_thin: bool,
+    scales: Scales | None = None,
+    least: float = -np.inf,
 ) -> Inferred | None:
     """The loops of a chain, judged; those of `trusted (M,)` are used in any case.
 
     `may_thin`: where the right loops leave more than `MOST_UNKNOWNS`, all are judged at the poses of some of them;
     without it None comes back then. `scales`: of the errors; by default those learned from the loops by which their
     places are likelier, and learned anew at the poses that they lead to where the drift of a long path had hidden how
-    loops err: where scales there differ much, other loops agree by them, and the places are likelier.
+    loops err: where scales there differ much, other loops agree by them, and the places are likelier. `least`: None
+    comes back too where loops that stand out contradict each other and reach no more log-evidence `at_first`.
     """
     learned = learned_scales(chain, outliers) if scales is None else [(scales, EVEN)]
     found: Inferred | None = None
     for given in learned:
-        other = _Trial.of(chain, outliers, trusted, may_thin, *given).found()
+        other = _Trial.of(chain, outliers, trusted, may_thin, *given).found(least)
         if other is None:
             return None
         found = other if found is None or other.rank > found.rank else found
@@ -139,12 +146,15 @@ class _TooManyLoops(Exception):
 @dataclass(frozen=True)
 class _Rated:
     """All loops at some poses: the `score (M,)` of each, the lesser of its log-odds and its log Bayes factor; the
-    shares (2,) of right and wrong ones; and the chain there.
+    shares (2,) of right and wrong ones, and their log-evidence; the chain there; and whether the loops that led there
+    contradict each other.
     """
 
     score: Floats
     shares: Floats
+    log_evidence: float
     linear: Linear
+    is_torn: bool
 
 
 @dataclass(frozen=True)
@@ -168,30 +178,33 @@ class _Trial:
         start = linearise(chain, chain.poses)
         return cls(start, judge(start, None, shares, outliers), shares, outliers, trusted, may_thin, scales)
 
-    def found(self) -> Inferred | None:
+    def found(self, least: float = -np.inf) -> Inferred | None:
         """What is `inferred`, or that nothing is used where nothing can be computed; None as in `infer`."""
         try:
-            return self.inferred()
+            return self.inferred(least)
         except _TooManyLoops:
             return None
         except np.linalg.LinAlgError:  # loops tear paths so far apart that covariances are lost in rounding
             reduced = thinned(self.start.chain, np.flatnonzero(self.trusted))
             return Inferred(self.trusted, self.alone, self.scales, self.start, self.start, reduced, 0.0, False, -np.inf)
 
-    def inferred(self) -> Inferred:
+    def inferred(self, least: float) -> Inferred | None:
         """The loops judged at the poses of the right ones. Where many that stand out on the bare chain are not used in
         the end, these are grown by halves too, and the places decide that are likelier together: evidence of single
-        loops counts a mistake as often as it is repeated.
+        loops counts a mistake as often as it is repeated. None as in `infer`, by the `least` log-evidence.
         """
         out = self.standing_out
-        at_once = self.grown(out, self.start, self.shares)
-        found = self.settled(*at_once)
+        used, rated = at_once = self.grown(out, self.start, self.shares)
+        if rated.is_torn and rated.log_evidence <= least:
+            return None
+        found = replace(self.settled(*at_once), at_first=rated.log_evidence)
         if (out & ~found.used).sum() <= REFUSED * out.sum():
             return found
         by_halves = self.halves_grown(np.flatnonzero(out))
-        if (by_halves[0] == at_once[0] & out).all():
+        if (by_halves[0] == used & out).all():
             return found
-        return max(found, self.settled(*self.grown(*by_halves)), key=lambda each: each.rank)
+        other = self.settled(*self.grown(*by_halves))
+        return replace(max(found, other, key=lambda each: each.rank), at_first=rated.log_evidence)
 
     @property
     def standing_out(self) -> Bools:
@@ -275,8 +288,8 @@ class _Trial:
         rows = rows[one_of_each_place(ends[rows])] if len(rows) else rows
         fit = optimised(Fit(self.reduced(rows), linear), MOST_STEPS)
         judged = judge(fit.linear, fit, shares, self.outliers)
-        shares, _ = mixture(judged.factor)
-        return _Rated(np.minimum(judged.factor, judged.log_odds), shares, fit.linear)
+        shares, log_evidence = mixture(judged.factor)
+        return _Rated(np.minimum(judged.factor, judged.log_odds), shares, log_evidence, fit.linear, fit.is_torn)
 
     def reduced(self, rows: Ints) -> Reduced:
         """The graph of these loops, of all where it may not be thinned."""
