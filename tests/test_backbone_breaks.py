@@ -8,8 +8,14 @@ import pytest
 
 from backbone_graphs import WORLDS, broken, drive, spanned
 from benchmarks.spoilt_graphs import simulated_cases
+from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
+from hodge_pipeline.solvers.backbone import inference
+from hodge_pipeline.solvers.backbone.chain import make_chain
+from hodge_pipeline.solvers.backbone.evidence import OutlierModel
+from hodge_pipeline.solvers.backbone.scales import Scales
+from hodge_pipeline.solvers.backbone.sequence import sequential_edges
 from hodge_pipeline.solvers.backbone.trust import find_backbone
 from hodge_pipeline.types import ViewGraph
 
@@ -114,3 +120,25 @@ def test_no_right_step_is_called_wrong(wrong: float) -> None:
         made = drive(seed=seed, world=WORLDS[seed], wrong=wrong, in_groups=bool(seed % 2), count=200, loops=60)
         backbone = find_backbone(made.graph)
         assert backbone is None or backbone.used[:199].all()
+
+
+def test_a_trial_ends_where_loops_contradict_each_other_and_explain_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where 947 loops were written the wrong way round, five trials of 10 CPU s each failed."""
+    judged: list[int] = []
+    settled = inference._Trial.settled
+    monkeypatch.setattr(inference._Trial, "settled", lambda *given: judged.append(1) or settled(*given))
+
+    def inferred(error_m: float, least: float = -np.inf) -> inference.Inferred | None:
+        graph, twists = drive(count=1000, loops=60, wrong=0.0).graph, np.zeros((1059, 6))
+        twists[-60:, 3:5] = error_m * np.random.default_rng(0).normal(size=(60, 2))
+        graph = replace(graph, i_from_j=graph.i_from_j @ se3.exp(twists))
+        chain = make_chain(graph, sequential_edges(graph))
+        judged.clear()
+        none = np.zeros(60, bool)
+        return inference.infer(chain, OutlierModel.of(chain), none, may_thin=True, scales=Scales(), least=least)
+
+    whole = inferred(2.0)
+    assert whole is not None and len(judged) == 2
+    assert inferred(2.0, whole.at_first) is None and not judged
+    assert inferred(2.0, whole.at_first - 1) is not None and len(judged) == 1
+    assert inferred(0.0, np.inf) is not None  # loops that agree are judged whatever they reach at first

@@ -198,7 +198,8 @@ class _Trial:
         if rated.is_torn and rated.log_evidence <= least:
             return None
         found = replace(self.settled(*at_once), at_first=rated.log_evidence)
-        if (out & ~found.used).sum() <= REFUSED * out.sum():
+        is_torn_trial = rated.is_torn and least > -np.inf
+        if is_torn_trial or (out & ~found.used).sum() <= REFUSED * out.sum():
             return found
         by_halves = self.halves_grown(np.flatnonzero(out))
         if (by_halves[0] == used & out).all():
