@@ -126,7 +126,12 @@ def test_a_trial_ends_where_loops_contradict_each_other_and_explain_no_more(monk
     """Where 947 loops were written the wrong way round, five trials of 10 CPU s each failed."""
     judged: list[int] = []
     settled = inference._Trial.settled
-    monkeypatch.setattr(inference._Trial, "settled", lambda *given: judged.append(1) or settled(*given))
+
+    def counted(*given: Any) -> inference.Inferred:
+        judged.append(1)
+        return settled(*given)
+
+    monkeypatch.setattr(inference._Trial, "settled", counted)
 
     def inferred(error_m: float, least: float = -np.inf) -> inference.Inferred | None:
         graph, twists = drive(count=1000, loops=60, wrong=0.0).graph, np.zeros((1059, 6))

@@ -191,15 +191,16 @@ class _Trial:
     def inferred(self, least: float) -> Inferred | None:
         """The loops judged at the poses of the right ones. Where many that stand out on the bare chain are not used in
         the end, these are grown by halves too, and the places decide that are likelier together: evidence of single
-        loops counts a mistake as often as it is repeated. None as in `infer`, by the `least` log-evidence.
+        loops counts a mistake as often as it is repeated. None as in `infer`, by the `least` log-evidence; where one
+        is given and loops that stand out contradict each other, they are grown at once only: a limit on cost.
         """
         out = self.standing_out
         used, rated = at_once = self.grown(out, self.start, self.shares)
         if rated.is_torn and rated.log_evidence <= least:
             return None
         found = replace(self.settled(*at_once), at_first=rated.log_evidence)
-        is_torn_trial = rated.is_torn and least > -np.inf
-        if is_torn_trial or (out & ~found.used).sum() <= REFUSED * out.sum():
+        once = rated.is_torn and least > -np.inf
+        if once or (out & ~found.used).sum() <= REFUSED * out.sum():
             return found
         by_halves = self.halves_grown(np.flatnonzero(out))
         if (by_halves[0] == used & out).all():
