@@ -219,9 +219,11 @@ def _better(
     """The chain with one more broken step bridged, and its loops judged; None where no step is broken."""
     surprising = found.scales.surprise or not found.confirmed
     founds = [found] if as_stated is None or not surprising else [found, as_stated]
+    # under confirmed loops a right break may reach less at first: two of RobotCar's 20, by 14 %
+    at_first = -np.inf if found.confirmed else found.at_first
     for broken, least in [each for one in founds for each in _candidates(chain, one, outliers)]:
         tried = bridged(chain, broken)
-        same = judge(tried, scales=found.scales, least=found.at_first)  # so that nothing but the step differs
+        same = judge(tried, scales=found.scales, least=at_first)  # so that nothing but the step differs
         if same is None or same.log_evidence <= found.log_evidence + least:
             continue
         if broken.usual or same.start.chain.corridors_over(broken.at, np.flatnonzero(same.used)) > 1:
