@@ -24,7 +24,7 @@ from hodge_pipeline.solvers.backbone.sequence import sequential_edges, steps_apa
 from hodge_pipeline.solvers.backbone.step_tests import AS_STATED, LONGEST_CYCLE, LOOPS_AT_A_STEP, TESTED, closes, gate
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.reweighted import SETTLED
-from hodge_pipeline.types import Floats, Ints, ViewGraph
+from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 AGREEING = 0.9
 """Share of those edges that must agree with each other and the steps. Of edges between fragments of rooms, every pair
@@ -53,7 +53,10 @@ def windowed(given: Fused) -> Fused:
     if not _many(chain, near):
         return given
     unknown = has_unit_information(graph)
-    weights, poses = _agreeing(_with_learned_covariance(chain, near) if unknown else chain, near)
+    learned = _with_learned_covariance(chain, near) if unknown else chain
+    fits, scale, untested = _fitting(learned, near)
+    near, fits = near[~untested], fits[~untested]
+    weights, poses = _agreeing(learned, near, fits, scale)
     (of_step, of_near), agree = np.split(weights, [len(at)]), weights[len(at) :] > 0
     good = near[agree]
     if len(good) < AGREEING * len(near) or not _many(chain, good):
@@ -112,13 +115,10 @@ def _with_learned_covariance(chain: Chain, near: Ints) -> Chain:
     return replace(chain, step_covariance=step, covariance=loop)
 
 
-def _agreeing(chain: Chain, near: Ints) -> tuple[Floats, Floats]:
-    """Weights (N,) of all steps and then of the `near` loops, 0 for those that disagree; and the poses (n, 4, 4) of a
-    solve with Student's t.
-
-    It starts without loops that disagree with the chain over steps which other loops confirm, and without steps that
-    two loops or more contradict and none confirms. An edge that errs no more than it states, and closes as right cycles
-    do, agrees however exact the others are.
+def _fitting(chain: Chain, near: Ints) -> tuple[Bools, float, Bools]:
+    """Which of the `near` loops (K,) agree with the chain; the factor on χ² by which loops err more than stated; and
+    which of the others (K,) are left to the judging of loops: they pass over a step that no loop confirms and none of a
+    short cycle tests. Wrong loops of one place agree with each other, and nothing of a window says otherwise there.
     """
     linear, ends, size = linearise(chain, chain.poses), chain.ends[near], len(chain.axes)
     chi2 = mahalanobis(linear.loops[0][near], by_path(linear, near))[0]
@@ -128,9 +128,28 @@ def _agreeing(chain: Chain, near: Ints) -> tuple[Floats, Floats]:
     usual_scale = float(np.median(usual)) / MEDIAN_CHI2[size] if len(usual) else 1.0
     scale = max(usual_scale, _rounding(chain, near))
     fits = chi2 <= STUDENT_99[size] * scale
+    short = ends[np.diff(ends, axis=1)[:, 0] <= LONGEST_CYCLE]
+    untested = (chain.over(ends[fits]) == 0) & (chain.over(short) == 0)
+    return fits, scale, ~fits & _pass_over(chain, ends, untested)
+
+
+def _pass_over(chain: Chain, ends: Ints, steps: Bools) -> Bools:
+    """Which of the spans (K, 2) of positions pass over one of these steps (n,)."""
+    count = np.append(0, np.cumsum(steps & chain.inner))
+    return np.asarray(count[ends[:, 1] + 1] > count[ends[:, 0] + 1])
+
+
+def _agreeing(chain: Chain, near: Ints, fits: Bools, scale: float) -> tuple[Floats, Floats]:
+    """Weights (N,) of all steps and then of the `near` loops, 0 for those that disagree; and the poses (n, 4, 4) of a
+    solve with Student's t; `fits` and `scale`: see `_fitting`.
+
+    It starts without loops that disagree with the chain over steps which other loops confirm, and without steps that
+    two loops or more contradict and none confirms. An edge that errs no more than it states, and closes as right cycles
+    do, agrees however exact the others are.
+    """
+    ends, size = chain.ends[near], len(chain.axes)
     doubted = chain.over(ends[fits]) == 0
-    over = np.append(0, np.cumsum(doubted & chain.inner))
-    fits |= over[ends[:, 1] + 1] > over[ends[:, 0] + 1]
+    fits = fits | _pass_over(chain, ends, doubted)
     at = np.flatnonzero(chain.step_edge >= 0)
     step = np.where(doubted & (chain.over(ends) > 1), 0.0, 1.0)[at]
     weights = np.concatenate([step, fits.astype(float)])
