@@ -111,7 +111,7 @@ def priors_told(graph: ViewGraph, kept: ViewGraph) -> tuple[tuple[str, ...], tup
     right = right_priors(kept, priors, solved)
     poses = solved(replace(kept, priors=priors.select(right)))
     excess = excess_of_priors(kept, priors.select(right), poses)
-    used = len(right) - unused
+    used = int(right.sum()) - unused
     told = (
         f"{counted(used, 'prior is|priors are')} off by {excess:.2g} times what {suiting(used, 'it states|they state')}"
     )

@@ -161,7 +161,8 @@ def _without_shift(
     if same.of_places < found.of_places + OF_A_SHIFT:
         return None
     again = judge(apart)
-    return apart, same if again is None or again.log_evidence < same.log_evidence else again, rows
+    is_better = again is not None and again.confirmed and again.log_evidence >= same.log_evidence
+    return apart, again if is_better else same, rows
 
 
 def _contradicted(found: Inferred) -> bool:
