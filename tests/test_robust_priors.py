@@ -124,6 +124,17 @@ def test_a_diagnosis_tells_priors_that_contradict_the_edges(dimension: int) -> N
     assert not any("prior" in finding for finding in good.findings)
 
 
+def test_priors_that_are_not_used_contradict_nothing_and_are_not_counted() -> None:
+    """The first ten of 40, of which three are wrong, lack the height: "of 40 priors"."""
+    spoilt = with_fixes(drive(dimension=3, world="town", seed=2, wrong=0.3, loops=60), far_off(40, 0.2)).graph
+    assert spoilt.priors is not None
+    information = spoilt.priors.information.copy()
+    information[:10, 5, 5] = 0.0
+    found = diagnose(replace(spoilt, priors=replace(spoilt.priors, information=information)))
+    assert found.findings[-1].startswith("5 of 30 priors contradict the edges and the others")
+    assert any(note.startswith("25 priors are off by") for note in found.notes)
+
+
 def test_a_diagnosis_tells_priors_that_err_more_than_they_state() -> None:
     made = drive(wrong=0.3, loops=60)
     off = np.random.default_rng(1).normal(0, 20 * FIX_M, (40, 3)) * [1, 1, 0]
