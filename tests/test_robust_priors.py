@@ -14,6 +14,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.refine.pose_graph import SolveOptions, solve_file
+from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Floats, Priors
 
 FIX_M = 0.3
@@ -133,6 +134,12 @@ def test_priors_that_are_not_used_contradict_nothing_and_are_not_counted() -> No
     found = diagnose(replace(spoilt, priors=replace(spoilt.priors, information=information)))
     assert found.findings[-1].startswith("5 of 30 priors contradict the edges and the others")
     assert any(note.startswith("25 priors are off by") for note in found.notes)
+
+
+def test_a_fix_that_states_no_rotation_is_called_no_edge() -> None:
+    """ "40 edges have no definite information on rotation"."""
+    notes = solve(with_fixes(drive(wrong=0.0, loops=20), far_off(40, 0.0)).graph).notes
+    assert not any("edge" in note for note in notes)
 
 
 def test_a_diagnosis_tells_priors_that_err_more_than_they_state() -> None:
