@@ -117,8 +117,8 @@ def _without_shared_shifts(
     outliers: OutlierModel,
     trusted: Bools,
 ) -> tuple[Chain, Inferred]:
-    """The chain and its loops without those that take a place for one that looks alike, by a shift that many share; what
-    was `found` where all loops are not likelier without that shift.
+    """The chain and its loops without those that take a place for one that looks alike, by a shift that many share;
+    what was `found` where all loops are not likelier without that shift.
 
     They bend the path until they fit: places that differ by a shift are all explained by one flight of stairs that is
     not there. With errors smaller by a factor of `SMALLER` they are refused. All loops are then judged without the
