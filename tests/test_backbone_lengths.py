@@ -49,7 +49,7 @@ def test_an_odometry_of_a_wrong_scale_is_named(dimension: int, world: str) -> No
 @pytest.mark.parametrize("times", [1.3, 0.8])
 def test_a_session_of_another_scale_is_named_by_its_vertices(times: float) -> None:
     named = told(of_length(drive(dimension=3, world="room").graph, times, 200, in_two=True))
-    assert named.startswith("consecutive edges of vertices 201 to 399 are ")
+    assert named.startswith("consecutive edges of vertices 200 to 399 are ")
     assert factor_of(named) == pytest.approx(times, rel=0.03)
 
 

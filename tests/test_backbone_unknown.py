@@ -1,6 +1,7 @@
-"""Rings whose edges state no information, so that their errors are learned from one right loop."""
+"""Errors learned from one right loop, since edges state none, and from edges that have none at all."""
 
 import numpy as np
+import pytest
 
 from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
@@ -37,3 +38,16 @@ def test_no_loop_is_called_wrong_where_none_is_used() -> None:
     assert not found.kept[loop].any()
     assert set(found.verdict[loop].tolist()) == {"suspect"}
     assert any("nothing confirms" in note for note in found.notes)
+
+
+@pytest.mark.filterwarnings("error")
+def test_edges_without_any_error_are_consistent() -> None:
+    """Thirty steps of a metre out and back: the errors learned of residuals that are exactly 0 had no inverse."""
+    places = np.zeros((60, 3))
+    places[:, 0] = np.append(np.arange(30), np.arange(30)[::-1])
+    poses = se3.from_parts(np.broadcast_to(np.eye(3), (60, 3, 3)), places)
+    loops = [(i, 59 - i) for i in range(0, 28, 3)] + [(0, 20), (3, 25)]
+    edges = np.array([(i, i + 1) for i in range(59)] + loops)
+    motions = se3.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]]
+    information = np.tile(100 * np.eye(6), (len(edges), 1, 1))
+    assert diagnose(ViewGraph.from_edges(np.arange(60), edges, motions, information)).kept.all()

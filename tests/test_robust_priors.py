@@ -14,6 +14,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.refine.pose_graph import SolveOptions, solve_file
+from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Floats, Priors
 
 FIX_M = 0.3
@@ -119,8 +120,26 @@ def test_a_diagnosis_tells_priors_that_contradict_the_edges(dimension: int) -> N
     made = drive(dimension=dimension, world="town", seed=2, wrong=0.3, loops=60)
     spoilt, good = (diagnose(with_fixes(made, far_off(40, share)).graph) for share in (0.2, 0.0))
     assert spoilt.findings[-1].startswith("8 of 40 priors contradict the edges and the others: that of vertex")
+    assert any(note.startswith("32 priors are off by") for note in spoilt.notes)
     assert any(note.startswith("40 priors are off by") for note in good.notes)
     assert not any("prior" in finding for finding in good.findings)
+
+
+def test_priors_that_are_not_used_contradict_nothing_and_are_not_counted() -> None:
+    """The first ten of 40, of which three are wrong, lack the height: "of 40 priors"."""
+    spoilt = with_fixes(drive(dimension=3, world="town", seed=2, wrong=0.3, loops=60), far_off(40, 0.2)).graph
+    assert spoilt.priors is not None
+    information = spoilt.priors.information.copy()
+    information[:10, 5, 5] = 0.0
+    found = diagnose(replace(spoilt, priors=replace(spoilt.priors, information=information)))
+    assert found.findings[-1].startswith("5 of 30 priors contradict the edges and the others")
+    assert any(note.startswith("25 priors are off by") for note in found.notes)
+
+
+def test_a_fix_that_states_no_rotation_is_called_no_edge() -> None:
+    """ "40 edges have no definite information on rotation"."""
+    notes = solve(with_fixes(drive(wrong=0.0, loops=20), far_off(40, 0.0)).graph).notes
+    assert not any("edge" in note for note in notes)
 
 
 def test_a_diagnosis_tells_priors_that_err_more_than_they_state() -> None:

@@ -111,13 +111,14 @@ def priors_told(graph: ViewGraph, kept: ViewGraph) -> tuple[tuple[str, ...], tup
     right = right_priors(kept, priors, solved)
     poses = solved(replace(kept, priors=priors.select(right)))
     excess = excess_of_priors(kept, priors.select(right), poses)
-    used = len(right) - unused
+    tested, wrong = len(right) - unused, int((~right).sum())
+    used = tested - wrong
     told = (
         f"{counted(used, 'prior is|priors are')} off by {excess:.2g} times what {suiting(used, 'it states|they state')}"
     )
     findings = []
-    if wrong := int((~right).sum()):
-        contradict = f"{wrong} of {counted(len(right), 'prior')} {suiting(wrong, 'contradicts|contradict')} the edges"
+    if wrong:
+        contradict = f"{wrong} of {counted(tested, 'prior')} {suiting(wrong, 'contradicts|contradict')} the edges"
         findings.append(f"{contradict} and the others: {_farthest(graph, priors, right, poses)}")
     if excess > MOST_EXCESS:
         findings.append(told)

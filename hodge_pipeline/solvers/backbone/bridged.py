@@ -34,8 +34,8 @@ agree, but for one of .5; of right ones .47 to .64 where 60 % of the motions are
 RobotCar's .39, .48.
 """
 JUDGED_TWICE = 1000
-"""Most loops that are judged by stated errors too where learned ones are only a few times as large: a limit on cost.
-RobotCar's 2438 took 1.1 CPU s more, of 1.5.
+"""Most loops that are judged by stated errors too where learned ones are only a few times as large, and without shifts
+that they share: a limit on cost. RobotCar's 2438 took 1.1 CPU s more for the first, of 1.5.
 """
 SMALLER, OF_A_SHIFT = (1 / 4, 1 / 16), 3 * BY_CHANCE
 """Factors on the learned errors by which mistaken loops are found; and the nats that a shift which they share must
@@ -117,8 +117,8 @@ def _without_shared_shifts(
     outliers: OutlierModel,
     trusted: Bools,
 ) -> tuple[Chain, Inferred]:
-    """The loops of a chain without those that take places for others alike, by shifts of the world that many share,
-    where all are likelier so; else what was `found`.
+    """The chain and its loops without those that take a place for one that looks alike, by a shift that many share;
+    what was `found` where all loops are not likelier without that shift.
 
     They bend the path until they fit: places that differ by a shift are all explained by one flight of stairs that is
     not there. With errors smaller by a factor of `SMALLER` they are refused. All loops are then judged without the
@@ -161,7 +161,9 @@ def _without_shift(
     if same.of_places < found.of_places + OF_A_SHIFT:
         return None
     again = judge(apart)
-    return apart, same if again is None or again.log_evidence < same.log_evidence else again, rows
+    if again is not None and again.confirmed and again.log_evidence >= same.log_evidence:
+        return apart, again, rows
+    return apart, same, rows
 
 
 def _contradicted(found: Inferred) -> bool:

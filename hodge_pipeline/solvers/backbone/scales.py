@@ -120,7 +120,7 @@ class Scales:
                 if len(residual) >= FEWEST_LEFT:
                     chi2 = mahalanobis(residual[:, axes], covariance[:, axes, axes])[0]
                     usual = np.median(chi2) / chdtri(residual[:, axes].shape[1], 0.5)
-                    factors[2 * kind + part] = np.sqrt(max(usual, np.finfo(float).tiny))
+                    factors[2 * kind + part] = np.sqrt(max(usual, np.finfo(float).eps))
         chain, logs = fit.linear.chain, np.log(astuple(self))
         # the chain has these scales, so that its bounds are relative to them
         turn, shift, *own = (logs + np.minimum(np.log(factors), _upper_bounds(chain))).tolist()

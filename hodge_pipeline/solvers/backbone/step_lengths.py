@@ -63,13 +63,12 @@ def misstated_lengths(fitted: Chain, poses: Floats, used: Ints) -> list[StepLeng
     while freedom > len(groups) and len(found) < len(alone):
         best = max(groups, key=lambda of: _gain(fit, of))
         other, factor = _refitted(fit, best)
-        usual = max(other.cost, np.finfo(float).tiny) / freedom
-        gain = 0.5 * freedom * np.log(fit.cost / (freedom * usual))
-        sigma = np.sqrt(usual / _score(other, best)[1])
-        if gain < BY_CHANCE + np.log(len(groups)) or sigma > TOLD:
+        before, after = (max(each.cost, np.finfo(float).tiny) for each in (fit, other))
+        if 0.5 * freedom * np.log(before / after) < BY_CHANCE + np.log(len(groups)):
             break
+        sigma = np.sqrt(after / freedom / _score(other, best)[1])
         _, more = _refitted(Fit(thinned(fitted, used), other.linear), best)
-        if abs(np.log(more)) > AGREE * sigma:
+        if sigma > TOLD or abs(np.log(more)) > AGREE * sigma:
             break
         found.append(StepLength(best, factor * more, best is measured))
         fit = other

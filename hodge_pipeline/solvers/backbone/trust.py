@@ -157,8 +157,9 @@ class Backbone:
         if not found.confirmed:
             return ()
         for each in misstated_lengths(found.start.chain, found.linear.poses, np.flatnonzero(found.used)):
-            ids = np.sort(self.vertex_ids[found.start.chain.order[each.of]])
-            which = "" if each.of_all else f" of vertices {ids[0]} to {ids[-1]}"
+            at = np.flatnonzero(each.of)
+            first, last = self.vertex_ids[found.start.chain.order[[at[0] - 1, at[-1]]]]
+            which = "" if each.of_all else f" of vertices {first} to {last}"
             times, how = (each.factor, "long") if each.factor > 1 else (1 / each.factor, "short")
             what = f"{self.named}{which} are {times:.2f} times too {how} against the loops"
             told.append(f"{what}, which is left so: check their scale")
