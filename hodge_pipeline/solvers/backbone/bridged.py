@@ -38,8 +38,8 @@ JUDGED_TWICE = 1000
 that they share: a limit on cost. RobotCar's 2438 took 1.1 CPU s more for the first, of 1.5.
 """
 SMALLER, OF_A_SHIFT = (1 / 4, 1 / 16), 3 * BY_CHANCE
-"""Factors on the learned errors by which mistaken loops are found, with the smaller one alone 286 wrong ones are kept for
-38; and the nats that a shift which they share must gain, more than chance for each of its axes.
+"""Factors on the learned errors by which mistaken loops are found; with the smaller alone 286 wrong ones of `alike` are
+kept for 38. And the nats that a shift which they share must gain, more than chance for each of its axes.
 """
 DRAWN = 3
 """Times that the motions of loops are drawn at random."""
