@@ -141,11 +141,11 @@ def degrees_of_freedom(graph: ViewGraph, solution: Solution) -> int:
     """How many more numbers edges and priors state than the poses of their solution have."""
     axes = PLANAR_AXES if dimension_of(graph) == 2 else np.arange(6)
     stated = int(measured_axes(graph.information[:, axes[:, None], axes]).sum())
-    informed = np.zeros(0, np.int64) if graph.priors is None else graph.priors.vertices
+    with_prior = np.zeros(0, np.int64) if graph.priors is None else graph.priors.vertices
     free = np.ones(int(solution.component.max(initial=-1)) + 1, np.int64)  # gauge: one pose of each component
-    free[solution.component[informed]] = 0
+    free[solution.component[with_prior]] = 0
     held = np.maximum(np.bincount(solution.component[graph.fixed], minlength=len(free)), free).sum()
-    return stated + len(axes) * int(len(informed) - graph.vertex_count + held)
+    return stated + len(axes) * int(len(with_prior) - graph.vertex_count + held)
 
 
 def _placed(graph: ViewGraph, poses: Floats, start: Floats | None) -> Floats:

@@ -53,16 +53,20 @@ def sure_jumps(
 def jump_note(work: Work, before: Floats, after: Floats, jumps: Ints) -> Note:
     """A note that names the jumps, and how long they are before and after, or by what turn they differ."""
     names = vertex_ids(work.scene.source)
-    steps = [f"from frame {names[k]} to {names[k + 1]} by {_told(before[k : k + 2], after[k : k + 2])}" for k in jumps]
+    arm_m = se3.ARM_M * float(work.recipe.scale)
+    told = [_told(before[k : k + 2], after[k : k + 2], arm_m) for k in jumps]
+    steps = [f"from frame {names[k]} to {names[k + 1]} by {how}" for k, how in zip(jumps, told, strict=True)]
     more = f"; and {len(steps) - MOST_JUMPS} more" if len(steps) > MOST_JUMPS else ""
     return Note("given jumps", len(jumps), "; ".join(steps[:MOST_JUMPS]) + more)
 
 
-def _told(before: Floats, after: Floats) -> str:
-    """How long the step between two poses (2, 4, 4) is, before and after, or by what turn they differ."""
+def _told(before: Floats, after: Floats, arm_m: float) -> str:
+    """How long the step between two poses (2, 4, 4) is, before and after, or by what turn they differ, where this moves
+    more at the end of an arm.
+    """
     steps = [se3.inverse(poses[0]) @ poses[1] for poses in (before, after)]
     shift_m, turn = step_difference(*steps)
-    if shift_m < se3.ARM_M * turn:
+    if shift_m < arm_m * turn:
         return f"a turn of {np.degrees(turn):.3g}°"
     return ", not ".join(length(float(np.linalg.norm(step[:3, 3]))) for step in steps)
 

@@ -193,10 +193,7 @@ class GraphEditor:
         return solution
 
     def _prepared(self, graph: ViewGraph, start: Floats | None) -> Setup:
-        setup = prepare(graph, start, self._fixed, full=self._objective == "full")
-        if self._full(setup) or not setup.weights.partly.any():
-            return setup
-        return prepare(graph, start, self._fixed, full=False)
+        return prepare(graph, start, self._fixed, full=self._objective == "full")
 
     def _full(self, setup: Setup) -> bool:
         return self._objective == "full" and setup.weights.definite

@@ -72,12 +72,8 @@ def solve(
     if priors is not None and len(priors.vertices):
         (whole, start), fixed = with_world(graph, priors, start, fixed), None
     rows, unheld = held_rows(whole, start, fixed)
-    full = objective == "full"
-    setup = prepare(whole, start, rows, dimension, direct=certificate, full=full)
-    if full and not setup.weights.definite:
-        full = False
-        if setup.weights.partly.any():
-            setup = prepare(whole, start, rows, dimension, direct=certificate, full=False)
+    setup = prepare(whole, start, rows, dimension, direct=certificate, full=objective == "full")
+    full = objective == "full" and setup.weights.definite
     notes = [
         *unheld,
         *setup.weights.notes,

@@ -70,8 +70,8 @@ def moves_in_plane(graph: ViewGraph) -> bool:
 def edge_weights(graph: ViewGraph, dimension: int, full: bool = True) -> Weights:
     """The weights of each edge: τ = d / tr(Ω_t⁻¹); κ = 3 / (2 tr(Ω_R⁻¹)), or Ω_θ in the plane (SE-Sync, section II).
 
-    Edges that measure some axes alone count in the `full` objective, where others hold what they do not measure; κ and
-    τ, those of the axes that they measure, then only lead to its minimum.
+    Edges that measure some axes alone count in the `full` objective, where no information is indefinite and other edges
+    hold what they do not measure; κ and τ, those of the axes that they measure, then only lead to its minimum.
     """
     notes: list[str] = []
     information = graph.information
@@ -83,10 +83,11 @@ def edge_weights(graph: ViewGraph, dimension: int, full: bool = True) -> Weights
     tau = _mean_precision(information[:, p:, p:])
     loops = graph.edges[:, 0] == graph.edges[:, 1]
     used, prior = ((kappa > 0) | (tau > 0)) & ~loops, graph.source == SOURCE
-    some = ~used & ~loops & ~prior
-    if some.any():
-        some[some] = _states_something(information[some])
-    partly = some & _joined(graph, (kappa > 0) & (tau > 0)) if full and some.any() else np.zeros_like(used)
+    of_either_sign = _indefinite(information)
+    indefinite = of_either_sign & used
+    some = ~used & ~loops & ~prior & ~of_either_sign & (np.einsum("eii->ei", information) > 0).any(axis=1)
+    can_count = full and some.any() and not indefinite.any()
+    partly = some & _joined(graph, (kappa > 0) & (tau > 0)) if can_count else np.zeros_like(used)
     if partly.any():
         used |= partly
         kappa[partly] = _measured_precision(information[partly, :p, :p]) / (2 if dimension == 3 else 1)
@@ -114,7 +115,6 @@ def edge_weights(graph: ViewGraph, dimension: int, full: bool = True) -> Weights
             f"{counted(far, 'edge is|edges are')} longer than the earth, ({i}, {j}) {lengths.max():.2g} m: "
             "check them and the unit"
         )
-    indefinite = _indefinite(information) & used
     if indefinite.any():
         notes.append(f"{int(indefinite.sum())} of {graph.edge_count} information matrices are indefinite")
     stated = np.concatenate([kappa[used], tau[used]])
@@ -138,11 +138,6 @@ def measured_axes(information: Floats) -> Ints:
     scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     values = np.linalg.eigvalsh(information * scale[:, :, None] * scale[:, None, :])
     return np.asarray((values > UNMEASURED).sum(axis=1), np.int64)
-
-
-def _states_something(information: Floats) -> Bools:
-    """Where (E,) a matrix has positive information on some axis, and is nowhere negative."""
-    return np.asarray((np.einsum("eii->ei", information) > 0).any(axis=1) & ~_indefinite(information))
 
 
 def _joined(graph: ViewGraph, whole: Bools) -> Bools:

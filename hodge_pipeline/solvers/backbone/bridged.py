@@ -156,14 +156,14 @@ def _without_shift(
         return None
     apart = without_shift(chain, linear.poses, rows, shift)
     same = judge(apart, scales=found.scales)  # so that nothing but the shift differs
-    if same is None or not same.confirmed or same.log_evidence < found.log_evidence:
+    if same is None or not same.confirmed or same.log_evidence <= found.log_evidence:
         return None
     if same.of_places < found.of_places + OF_A_SHIFT:
         return None
     again = judge(apart)
-    if again is not None and again.confirmed and again.log_evidence >= same.log_evidence:
-        return apart, again, rows
-    return apart, same, rows
+    if again is None or not again.confirmed or again.log_evidence < same.log_evidence:
+        again = same
+    return apart, again, rows
 
 
 def _contradicted(found: Inferred) -> bool:

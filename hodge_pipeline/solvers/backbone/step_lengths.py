@@ -67,8 +67,10 @@ def misstated_lengths(fitted: Chain, poses: Floats, used: Ints) -> list[StepLeng
         if 0.5 * freedom * np.log(before / after) < BY_CHANCE + np.log(len(groups)):
             break
         sigma = np.sqrt(after / freedom / _score(other, best)[1])
+        if sigma > TOLD:
+            break
         _, more = _refitted(Fit(thinned(fitted, used), other.linear), best)
-        if sigma > TOLD or abs(np.log(more)) > AGREE * sigma:
+        if abs(np.log(more)) > AGREE * sigma:
             break
         found.append(StepLength(best, factor * more, best is measured))
         fit = other
