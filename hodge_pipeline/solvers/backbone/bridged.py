@@ -8,19 +8,18 @@ from functools import partial
 
 import numpy as np
 
-from hodge_pipeline.complex.chi2 import MEDIAN_CHI2
 from hodge_pipeline.solvers.backbone.bias import without_bias
 from hodge_pipeline.solvers.backbone.breaks import Break, Runs, agreed_breaks, unusual_breaks
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mixture
-from hodge_pipeline.solvers.backbone.fit import Fit, optimised
+from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, optimised
 from hodge_pipeline.solvers.backbone.inference import Inferred, by_chance, infer, refused, refused_alike, without
 from hodge_pipeline.solvers.backbone.judge import densities
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
-from hodge_pipeline.solvers.backbone.mistakes import shared_shift, without_shift
+from hodge_pipeline.solvers.backbone.mistakes import elsewhere, shared_shift, without_shift
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
-from hodge_pipeline.solvers.backbone.places import MISTAKEN, MISTAKEN_PLACES, MOST_STEPS, agreeing_groups
+from hodge_pipeline.solvers.backbone.places import MISTAKEN, MISTAKEN_PLACES, agreeing_groups
 from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
 from hodge_pipeline.solvers.backbone.step_model import StepModel
 from hodge_pipeline.types import Bools, Ints
@@ -41,8 +40,11 @@ SMALLER, OF_A_SHIFT = (1 / 4, 1 / 16), 3 * BY_CHANCE
 """Factors on the learned errors by which mistaken loops are found; with the smaller alone 286 wrong ones of `alike` are
 kept for 38. And the nats that a shift which they share must gain, more than chance for each of its axes.
 """
-DRAWN = 3
-"""Times that the motions of loops are drawn at random."""
+STRAINED, TORN = 0.03, 0.5
+"""Shares of the runs of steps that loops bend by more than 1 % of right ones are bent, beyond which ... and beyond which the loops are not right.
+"""
+MOVED = 3
+"""Times that loops are moved elsewhere."""
 
 
 def infer_bridged(
@@ -105,7 +107,11 @@ def _bridged(
         as_stated = _as_stated(chain, found, judge)
     # a break found by unconfirmed loops is not confirmed either
     for one, other in [(chain, found)] if found is first else [(chain, found), (unbroken, first)]:
-        if other.confirmed and not (_contradicted(other) and _random_motions_do_as_well(one, other, trusted, judge)):
+        strain = other.scales.strain(one, other.used, other.linear)
+        if not other.confirmed or strain > TORN:
+            continue
+        doubtful = strain > STRAINED or _contradicted(other)
+        if not (doubtful and _elsewhere_do_as_well(one, other, trusted, judge)):
             return one, other
     return unbroken, refused(first, trusted)
 
@@ -172,20 +178,14 @@ def _contradicted(found: Inferred) -> bool:
     return bool(loops_at_place(places[used]).sum() < CONTRADICTED * loops_at_place(places)[used].sum())
 
 
-def _random_motions_do_as_well(
-    chain: Chain, found: Inferred, trusted: Bools, judge: Callable[..., Inferred | None]
-) -> bool:
-    """Whether loops between the same places reach as much log-evidence with motions drawn from a normal distribution as
-    wide as that of the measured ones; those of `trusted (M,)` loops stay.
+def _elsewhere_do_as_well(chain: Chain, found: Inferred, trusted: Bools, judge: Callable[..., Inferred | None]) -> bool:
+    """Whether the loops, but for `trusted (M,)` ones, reach half of the log-evidence where those of each place are moved
+    to two other places.
     """
-    rng, twists = np.random.default_rng(4), chain.log(chain.motion)
-    middle = np.median(twists, axis=0)
-    spread = np.median(np.abs(twists - middle), axis=0) / np.sqrt(MEDIAN_CHI2[1])
-    for _ in range(DRAWN):
-        drawn = chain.exp(middle + spread * rng.standard_normal(twists.shape))
-        motion = np.where(trusted[:, None, None], chain.motion, drawn)
-        other = judge(replace(chain, motion=motion), scales=found.scales)
-        if other is not None and other.log_evidence > found.log_evidence - BY_CHANCE:
+    rng = np.random.default_rng(4)
+    for _ in range(MOVED):
+        other = judge(elsewhere(chain, ~trusted, rng), scales=found.scales)
+        if other is not None and 2 * other.log_evidence > found.log_evidence:
             return True
     return False
 

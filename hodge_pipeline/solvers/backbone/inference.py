@@ -12,12 +12,12 @@ from scipy.special import expit
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, EVEN, OutlierModel, mixture
-from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, from_rotations, optimised, thinned
+from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, Reduced, from_rotations, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, densities, judge
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.mistakes import Mistake, mistakes
-from hodge_pipeline.solvers.backbone.places import MISTAKEN, MOST_STEPS, Places
+from hodge_pipeline.solvers.backbone.places import MISTAKEN, Places
 from hodge_pipeline.solvers.backbone.polish import polished
 from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
 from hodge_pipeline.types import Bools, Floats, Ints

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scipy.special import gammaln, pdtrc
 
 from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel, log_student, student_log_density
-from hodge_pipeline.solvers.backbone.fit import Fit, optimised, thinned
+from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, by_path, judge
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.loop_places import corridors, loops_at_place, one_of_each_place
@@ -22,8 +22,6 @@ from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.scales import decoys
 from hodge_pipeline.types import Bools, Floats, Ints
 
-MOST_STEPS = 15
-"""Gauss–Newton steps: a limit on cost."""
 ALIKE = 0.75
 """Share of a place's loops that another used place must have to be its rival; an unused one needs as many loops."""
 MISTAKEN_PLACES = 0.2
