@@ -78,6 +78,8 @@ def elsewhere(chain: Chain, moved: Bools, rng: np.random.Generator) -> Chain:
     agree with each other as they did.
     """
     rows = np.flatnonzero(moved)
+    if not len(rows):
+        return chain
     one = rows[one_of_each_place(chain.places[rows])]
     nearest = cKDTree(chain.places[one]).query(chain.places[rows], p=np.inf)[1]
     ends = chain.ends.copy()

@@ -130,9 +130,9 @@ class Scales:
         return Scales(*np.exp([turn, shift, *own]).tolist())
 
     def strain(self, chain: Chain, used: Bools, linear: Linear) -> float:
-        """The share of the runs of steps between used loops (M,) that these bend by more than 1 % of right ones are bent,
-        at poses near `linear`: by errors as stated or larger by these scales, and once more up to twice as large where
-        their median says so, as coarsely as scales are learned. 0 where nothing is stated.
+        """The share of the runs of steps between used loops (M,) that these bend by more than 1 % of right loops do, at
+        poses near `linear`. Errors are as stated, or larger by these scales, and up to twice as large again where their
+        median is, since scales are learned so coarsely. 0 where nothing is stated.
         """
         if not chain.stated or not used.any():
             return 0.0
