@@ -26,7 +26,7 @@ from hodge_pipeline.diagnosis.result import (
     WRONG,
     Diagnosis,
 )
-from hodge_pipeline.diagnosis.robust_poses import Solved
+from hodge_pipeline.diagnosis.robust_poses import Solved, meets_no_loops
 from hodge_pipeline.diagnosis.robust_priors import priors_told
 from hodge_pipeline.diagnosis.shared_blame import share_blame
 from hodge_pipeline.diagnosis.wording import reasons
@@ -140,9 +140,13 @@ class _ByCycles:
 
     @cached_property
     def explains_nothing(self) -> bool:
-        """Whether cycles close no better than by chance or the sequence is folded: `close_by_chance`, `is_folded`."""
+        """Whether cycles close no better than by chance, the sequence is folded, or it meets none of the loops, which the
+        drift of a long path hides: `close_by_chance`, `is_folded`, `meets_no_loops`.
+        """
         known = self.evidence
         if close_by_chance(self.cycles, known.graph.i_from_j, known.noise, known.reach_m):
+            return True
+        if meets_no_loops(known, self.fit):
             return True
         return is_folded(self.stated, self.found.kept, self.found.world_from_cam)
 

@@ -123,3 +123,12 @@ def chi2_at(
     chi2 = turned / (turn * (1 + finite_resistance)) + shifted / (shift * (1 + finite_resistance) + swing)
     chi2 *= (1 + student_weight * finite_resistance) ** 2
     return np.where(np.not_equal(*piece[graph.edges.T]), np.inf, chi2)
+
+
+def meets_no_loops(evidence: Evidence, found: Solved) -> bool:
+    """Whether most used edges between views that are not consecutive are beyond the gate at these poses, by their own
+    noise alone: the poses are then those of the consecutive edges.
+    """
+    loops = found.used & (np.abs(np.diff(evidence.graph.edges, axis=1)[:, 0]) > 1)
+    off = chi2_at(evidence, found.poses, found.piece, np.zeros(len(loops))) > GATE
+    return bool(2 * off[loops].sum() > loops.sum())

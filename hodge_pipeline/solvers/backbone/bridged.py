@@ -28,9 +28,9 @@ MOST_BREAKS, TRIED_AT_ONCE = 10, 2
 """Breaks that are bridged one after the other, and that are tried each time."""
 CONTRADICTED = 1 / 3
 """Share of the loops at the places of used ones that must be used: with fewer, these are compared with the same loops
-elsewhere, which takes up to three times as long as all else. In parts of four graphs of the literature by chance .08 to .35
-agree, but for one of .5; of right ones .47 to .64 where 60 % of the motions are wrong, .21 to .35 where 90 % are; of
-RobotCar's .39, .48.
+elsewhere, which takes up to three times as long as all else. In parts of four graphs of the literature by chance .08 to
+.35 agree, but for one of .5; of right ones .47 to .64 where 60 % of the motions are wrong, .21 to .35 where 90 % are;
+of RobotCar's .39, .48.
 """
 JUDGED_TWICE = 1000
 """Most loops that are judged by stated errors too where learned ones are only a few times as large, and without shifts
@@ -41,11 +41,12 @@ SMALLER, OF_A_SHIFT = (1 / 4, 1 / 16), 3 * BY_CHANCE
 kept for 38. And the nats that a shift which they share must gain, more than chance for each of its axes.
 """
 STRAINED, TORN = 0.03, 0.5
-"""Shares of the runs of steps which loops bend by more than 1 % of right ones are bent: three times as many, from which
-on the loops are compared with the same loops elsewhere; and most of them, which no right loops bend so. In six graphs of
-SLAM and 170 simulated ones right loops bend 0 to .05; wrong ones in groups of ten .05 to .09, those that fold FRH .99.
+"""Shares of the runs of steps which loops bend by more than 1 % of right loops do: three times as many, from which on
+the loops are compared with the same loops elsewhere; and most of them, which right loops never bend so. In six graphs
+of SLAM and 170 simulated ones right loops bend 0 to .05; wrong ones in groups of ten .05 to .11, and .99 where they fold
+the path.
 """
-MOVED = 3
+MOVED = 5
 """Times that loops are moved elsewhere."""
 
 
