@@ -92,6 +92,15 @@ def drive(
     return Drive(graph, truth, np.arange(len(edges)) < len(steps) + len(good))
 
 
+def with_weak_steps(made: Drive, sigma: float, seed: int) -> Drive:
+    """The drive in the plane with steps that err by so many radians and metres, and state it."""
+    graph, steps = made.graph, np.abs(np.diff(made.graph.edges, axis=1)[:, 0]) == 1
+    off = se3.exp(_noise(np.random.default_rng(seed), np.where(steps[:, None], sigma, [[0.0, 0.0]]), 2))
+    information = graph.information.copy()
+    information[np.ix_(steps, PLANAR_AXES, PLANAR_AXES)] = np.eye(3) / sigma**2
+    return replace(made, graph=replace(graph, i_from_j=graph.i_from_j @ off, information=information))
+
+
 def round_trip(
     seed: int, loops: int, *, dimension: int = 3, wrong: int = 0, group: int = 1, only_wrong: bool = False
 ) -> Drive:

@@ -140,8 +140,8 @@ class _ByCycles:
 
     @cached_property
     def explains_nothing(self) -> bool:
-        """Whether cycles close no better than by chance, the sequence is folded, or it meets none of the loops, which the
-        drift of a long path hides: `close_by_chance`, `is_folded`, `meets_no_loops`.
+        """Whether cycles close no better than by chance, the sequence is folded, or it meets none of its loops, which
+        the drift of a long path hides: `close_by_chance`, `is_folded`, `meets_no_loops`.
         """
         known = self.evidence
         if close_by_chance(self.cycles, known.graph.i_from_j, known.noise, known.reach_m):
