@@ -55,9 +55,11 @@ def agreed_breaks(pairwise: PairwiseConsistency, usual: StepModel) -> list[Break
         fit, far = may & (fits > 0), may & (fits <= 0)
         found = [_break(pairwise, usual, seed, at[fit], score[fit])] if fit.any() else []
         if far.any():
-            broken = _far_break(pairwise, seed, at[far], score[far])
-            if chain.corridors_over(broken.at, rows[(factor > 0) & (gain > 0)]) > 1:  # else no trial will show as many
-                found.append(broken)
+            # bridged as far as the loop asks for: the robot was carried on, or its odometry stood still
+            row = np.flatnonzero(far)[np.argmax(score[far])]
+            one = int(at[row])
+            if chain.corridors_over(one, rows[(factor > 0) & (gain > 0)]) > 1:  # else no trial will show as many
+                found.append(Break(one, *pairwise.bridge(seed, one - 1, one), float(score[row]), usual=False))
         out += found
     return sorted(out, key=lambda each: -each.log_evidence)
 
@@ -81,15 +83,6 @@ def _break(pairwise: PairwiseConsistency, usual: StepModel, loop: int, at: Ints,
     wide = usual.covariance * max(1.0, 1 / float(tail_weight(chi2, off.shape[1])))
     towards = wide @ np.linalg.solve(wide + covariance[0], off[0])
     return Break(int(one[0]), usual.centre @ pairwise.chain.exp(towards), wide, float(score[row]))
-
-
-def _far_break(pairwise: PairwiseConsistency, loop: int, at: Ints, score: Floats) -> Break:
-    """The break at the position `at (K,)` of the highest score (K,), bridged as far as the loop asks for: the robot was
-    carried on, or its odometry stood still.
-    """
-    row = int(np.argmax(score))
-    one = int(at[row])
-    return Break(one, *pairwise.bridge(loop, one - 1, one), float(score[row]), usual=False)
 
 
 def _shifted_aside(pairwise: PairwiseConsistency, usual: StepModel, loop: int, at: Ints) -> Bools:
@@ -144,7 +137,7 @@ class Runs:
             chain,
             loop_edge=np.full(len(low), -1),
             ends=used.ends[used.runs],
-            motion=chain.compose(chain.between(poses[low], poses[high]), ahead),
+            motion=chain.between(poses[low], poses[high]) @ ahead,
             covariance=chain.carried(back, tense * (total - fit.runs)),
         )
         none = np.zeros(len(low))

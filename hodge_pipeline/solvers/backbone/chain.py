@@ -98,7 +98,7 @@ class Chain:
         """The chain with a rotation (r,) more in each measured step."""
         twist = np.zeros((self.size, len(self.axes)))
         twist[self.inner & ~self.bridged, : len(by)] = by
-        return replace(self, step=self.compose(self.step, self.exp(twist)), bias=self.bias - by)
+        return replace(self, step=self.step @ self.exp(twist), bias=self.bias - by)
 
     @cached_property
     def poses(self) -> Floats:
@@ -150,7 +150,7 @@ class Chain:
 
     def adjoint(self, poses: Floats) -> Floats:
         """Adjoint matrices (..., p, p) of poses, in the free axes."""
-        return se3.adjoint(poses) if self.is_spatial else plane.adjoint(poses)
+        return np.asarray(se3.adjoint(poses)[..., self.axes[:, None], self.axes])
 
     def lever(self, origin: Floats) -> Floats:
         """Lever arms (K, 3, 3), (K, 2, 1) in the plane: the lower left block of the adjoint of a shift by −origin."""
@@ -167,10 +167,6 @@ class Chain:
     def of_both_ends(self, motions: Floats, covariance: Floats) -> Floats:
         """Mean covariances (M, p, p), in j's axes, of motions i_from_j (M, 4, 4) that err alike at both ends."""
         return 0.5 * (covariance + self.carried(se3.inverse(motions), covariance))
-
-    def compose(self, a: Floats, b: Floats) -> Floats:
-        """Motions `a b` (..., 4, 4)."""
-        return np.asarray(a @ b) if self.is_spatial else plane.compose(a, b)
 
     def between(self, a: Floats, b: Floats) -> Floats:
         """Motions `a⁻¹ b` (..., 4, 4)."""

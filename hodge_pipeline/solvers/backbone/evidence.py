@@ -14,6 +14,8 @@ from hodge_pipeline.types import Bools, Floats, Ints
 
 BY_CHANCE = float(np.log(100.0))
 """Log-evidence, in nats, that chance reaches in one graph of a hundred."""
+FEWEST = 10
+"""Fewest values of which the median tells a scale, to a fifth."""
 PAIRS, FEWEST_PAIRS = 4000, 200
 """Random pairs of positions that an outlier shape is estimated from; an octave with fewer gets that of any two."""
 

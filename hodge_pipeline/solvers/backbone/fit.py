@@ -89,7 +89,7 @@ def thinned(chain: Chain, rows: Ints) -> Reduced:
     while True:
         chosen = spread[np.linspace(0, len(spread) - 1, count).astype(np.int64)]
         reduced = Reduced.of(chain, np.sort(chosen))
-        unknowns = reduced.network.core_size * len(chain.axes)
+        unknowns = (reduced.network.plan.size - reduced.network.plan.core) * len(chain.axes)
         if unknowns <= MOST_UNKNOWNS:
             return reduced
         count = round(THINNING * count * MOST_UNKNOWNS / unknowns)
@@ -212,8 +212,8 @@ class Fit:
         chain = linear.chain
         out = self._bent(chain.log(chain.between(move[first], move[second])))
         out[~touched] = 0.0
-        moved = chain.compose(chain.exp(out), linear.poses)
-        moved[touched] = chain.compose(move[self.reduced.anchor[touched]], moved[touched])
+        moved = chain.exp(out) @ linear.poses
+        moved[touched] = move[self.reduced.anchor[touched]] @ moved[touched]
         return moved
 
     def _bent(self, gap: Floats) -> Floats:

@@ -60,7 +60,7 @@ def shared_shift(chain: Chain, poses: Floats, rows: Ints) -> tuple[Floats, int]:
     poses (n, 4, 4) have them; and how many of them take them nearly so far there.
     """
     i, j = chain.ends[rows].T
-    shifts = (chain.compose(poses[i], chain.motion[rows]) - poses[j])[:, :3, 3]
+    shifts = (poses[i] @ chain.motion[rows] - poses[j])[:, :3, 3]
     usual = np.median(shifts, axis=0)
     return usual, int((np.linalg.norm(shifts - usual, axis=1) < SAME_SHIFT * np.linalg.norm(usual)).sum())
 

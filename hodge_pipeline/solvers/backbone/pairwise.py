@@ -66,7 +66,7 @@ class PairwiseConsistency:
         chain, poses, total = self.chain, self.linear.poses, self.linear.covariance
         a, b = chain.ends[loop].T
         from_end = chain.between(poses[b], poses[high])
-        end = chain.compose(chain.compose(poses[a], chain.motion[loop]), from_end)
+        end = poses[a] @ chain.motion[loop] @ from_end
 
         def local(frame: Floats, covariance: Floats) -> Floats:
             return chain.carried(se3.inverse(turned(frame)), shifted(covariance, chain.lever(frame[:, :3, 3])))

@@ -18,14 +18,6 @@ def exp(xi: Floats) -> Floats:
     return _motions(cosine**2 - sine**2, 2 * sine * cosine, x, y)
 
 
-def compose(a: Floats, b: Floats) -> Floats:
-    """Motions `a b` (..., 4, 4)."""
-    c, s, x, y = a[..., 0, 0], a[..., 1, 0], b[..., 0, 3], b[..., 1, 3]
-    cosine, sine = b[..., 0, 0], b[..., 1, 0]
-    shift_x, shift_y = a[..., 0, 3] + c * x - s * y, a[..., 1, 3] + s * x + c * y
-    return _motions(c * cosine - s * sine, s * cosine + c * sine, shift_x, shift_y)
-
-
 def between(a: Floats, b: Floats) -> Floats:
     """Motions `a⁻¹ b` (..., 4, 4)."""
     c, s = a[..., 0, 0], a[..., 1, 0]
@@ -50,15 +42,6 @@ def log(motions: Floats) -> Floats:
     along = np.where(small, 1 - half**2 / 3, half / np.tan(np.where(small, 1.0, half)))
     x, y = motions[..., 0, 3], motions[..., 1, 3]
     return np.stack([2 * half, along * x + half * y, along * y - half * x], axis=-1)
-
-
-def adjoint(motions: Floats) -> Floats:
-    """Ad (..., 3, 3) of motions (..., 4, 4)."""
-    out = np.zeros((*motions.shape[:-2], 3, 3))
-    out[..., 0, 0] = 1.0
-    out[..., 1, 0], out[..., 2, 0] = motions[..., 1, 3], -motions[..., 0, 3]
-    out[..., 1:, 1:] = motions[..., :2, :2]
-    return out
 
 
 def carried(motions: Floats, covariance: Floats) -> Floats:

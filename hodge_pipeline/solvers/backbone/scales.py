@@ -15,6 +15,7 @@ from hodge_pipeline.solvers.backbone.credible import MOST_OF_A_STEP
 from hodge_pipeline.solvers.backbone.evidence import (
     BY_CHANCE,
     EVEN,
+    FEWEST,
     OutlierModel,
     OutlierResiduals,
     mahalanobis,
@@ -51,8 +52,6 @@ DECOYS = 4
 """Decoys per loop: with one, scales of loops differed up to eightfold from one draw to the next."""
 SURPRISING = 2.5
 """Learned scale of steps that tells something: right loops of 288 walks that err as stated ask for up to 2."""
-FEWEST_LEFT = 10
-"""Loops and runs at a solution of which it tells their scale, to a fifth."""
 MOST_LOOPS = 3000
 """Loops that scales are learned from: more hardly change them."""
 
@@ -118,7 +117,7 @@ class Scales:
         for kind, rows in enumerate((fit.reduced.of_runs, fit.reduced.of_loops)):
             residual, covariance = fit.left_out(rows)
             for part, axes in enumerate((slice(0, split), slice(split, None))):
-                if len(residual) >= FEWEST_LEFT:
+                if len(residual) >= FEWEST:
                     chi2 = mahalanobis(residual[:, axes], covariance[:, axes, axes])[0]
                     usual = np.median(chi2) / chdtri(residual[:, axes].shape[1], 0.5)
                     factors[2 * kind + part] = np.sqrt(max(usual, np.finfo(float).eps))

@@ -48,11 +48,6 @@ class NormalEquations:
         slot = np.where(high < len(free), np.searchsorted(plan.keys, low * len(free) + high), -1)
         return cls(edges, component, place, slot, plan)
 
-    @property
-    def core_size(self) -> int:
-        """How many vertices are inverted densely."""
-        return self.plan.size - self.plan.core
-
     def factor(self, precision: Floats, carry: Floats) -> Factored:
         """The normal equations' factor; `precision (E, p, p)` of each edge's `x_j − A x_i`, `carry (E, p, p)` is A."""
         size, p = self.plan.size, precision.shape[-1]

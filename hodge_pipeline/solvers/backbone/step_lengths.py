@@ -14,6 +14,7 @@ from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE
 from hodge_pipeline.solvers.backbone.fit import Fit, optimised, thinned
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
+from hodge_pipeline.solvers.backbone.places import MOST_STEPS
 from hodge_pipeline.types import Bools, Floats, Ints
 
 LEAST_NAMED = float(np.log(1.07))
@@ -29,9 +30,8 @@ they tell one that differs by 3.5 to 6.
 """
 SPREAD = 0.5
 """Prior standard deviation of a factor, for one that loops do not tell."""
-ROUNDS, MOST_STEPS, SETTLED = 5, 20, 1e-3
-"""Refits of a factor, and Gauss–Newton steps of each: limits on cost; and the change of its logarithm that ends them.
-"""
+ROUNDS, SETTLED = 5, 1e-3
+"""Refits of a factor: a limit on cost; and the change of its logarithm that ends them."""
 
 
 @dataclass(frozen=True)

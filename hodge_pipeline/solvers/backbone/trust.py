@@ -225,19 +225,18 @@ def find_backbone(
         repeats &= np.isin(pair, pair[_in_order(graph, repeats)])
     single = loops_once(fused(graph, repeats), ~chosen) if chosen.any() else fused(graph, repeats)
     single = windowed(single) if trust in (AUTO, SEQUENTIAL) else single
-    backbone = _of_single_steps(
-        single.graph, trust, in_lattice, most_breaks, lambda loops: is_lattice(single.rows[loops])
-    )
+    backbone = _of_single_steps(graph, single, trust, in_lattice, most_breaks, is_lattice)
     if backbone is None:
         return None
     named = backbone.named if trust in (AUTO, SEQUENTIAL) else f"edges of {trust}"
-    return _of_all_edges(graph, replace(backbone, named=named, vertex_ids=ids), single)
+    return replace(backbone, named=named, vertex_ids=ids)
 
 
 def _of_single_steps(
-    graph: ViewGraph, trust: str, in_lattice: bool, most_breaks: int, is_lattice: Callable[[Ints], bool]
+    whole: ViewGraph, single: Fused, trust: str, in_lattice: bool, most_breaks: int, is_lattice: Callable[[Ints], bool]
 ) -> Backbone | None:
-    """The backbone of a graph with one edge for each step: see `find_backbone`."""
+    """The backbone of a graph, judged on its fused graph with one edge for each step: see `find_backbone`."""
+    graph = single.graph
     chosen = sequential_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
     if trust == AUTO and chosen.sum() < max(FEWEST_STEPS, COVERED * graph.vertex_count):
         return None
@@ -261,25 +260,22 @@ def _of_single_steps(
         agree = agreeing_loops(chain, ~found.used)
         return bool(chain.broken.sum() >= FEW_BREAKS or agree > AGREEING_REFUSED * steps.sum())
 
-    inferred = infer_bridged(
-        chain,
-        trusted,
-        may_thin=in_lattice or not many_loops,
-        most=most,
-        is_sought=lambda unbroken: (
-            not (many_loops and is_doubted(unbroken) and is_lattice(chain.loop_edge[unbroken.used]))
-        ),
-    )
+    def is_sought(unbroken: Inferred) -> bool:
+        loops = single.rows[chain.loop_edge[unbroken.used]]
+        return not (many_loops and is_doubted(unbroken) and is_lattice(loops))
+
+    inferred = infer_bridged(chain, trusted, may_thin=in_lattice or not many_loops, most=most, is_sought=is_sought)
     if inferred is None:
         return None
     chain, found = inferred
     doubted = many_loops and is_doubted(found)
     if in_lattice or len(found.reduced.active) >= found.used.sum():
-        return _backbone(graph, chain, found, found.polished, steps, doubted)
-    never_wrong = steps.copy()
-    never_wrong[chain.loop_edge] = trusted
+        return _backbone(whole, single, chain, found, found.polished, doubted)
     as_judged = found.linear, np.ones(len(found.used))
-    return of_every_loop(graph, _backbone(graph, chain, found, as_judged, steps, doubted), never_wrong)
+    backbone = _backbone(whole, single, chain, found, as_judged, doubted)
+    never_wrong = backbone.steps.copy()
+    never_wrong[single.rows[chain.loop_edge]] = trusted
+    return of_every_loop(whole, backbone, never_wrong)
 
 
 def _of_source(graph: ViewGraph, source: str) -> Bools:
@@ -296,66 +292,54 @@ def _in_order(graph: ViewGraph, chosen: Bools) -> Bools:
 
 
 def _backbone(
-    graph: ViewGraph, chain: Chain, found: Inferred, solved: tuple[Linear, Floats], steps: Bools, doubted: bool
+    graph: ViewGraph, single: Fused, chain: Chain, found: Inferred, solved: tuple[Linear, Floats], doubted: bool
 ) -> Backbone:
-    used, right, chi2 = steps.copy(), np.full(graph.edge_count, np.nan), np.full(graph.edge_count, np.nan)
-    used[chain.loop_edge] = found.used
-    used[chain.step_edge[chain.broken]] = False
+    """The backbone in rows of `graph`, as found on the fused graph `single`. A merged edge is used where none of its
+    steps is broken; a copy of a loop where that is, or merged or contradicted as one that a window took.
+    """
+    loop_of = np.full(graph.edge_count, -1)
+    loop_of[single.rows[chain.loop_edge]] = np.arange(len(chain.loop_edge))
+    copied = loop_of[single.copied]
+    loops = np.append(single.rows[chain.loop_edge], single.copies[copied >= 0])
+    again = np.append(np.arange(len(chain.loop_edge)), copied[copied >= 0])
+    merged, contradicted = (
+        np.append(rows, single.copies[np.isin(single.copied, rows)]) for rows in (single.merged, single.contradicted)
+    )
+    is_merged, is_contradicted, used = np.zeros((3, graph.edge_count), bool)
+    right, chi2 = np.full((2, graph.edge_count), np.nan)
+    is_merged[merged] = is_contradicted[contradicted] = True
+    chain = replace(
+        chain.with_loops(again, chain.ends[again]),
+        loop_edge=loops,
+        step_edge=np.append(single.rows, -1)[chain.step_edge],
+    )
+    steps = is_merged.copy()
+    steps[chain.step_edge[chain.step_edge >= 0]] = True
+    used[chain.step_edge[chain.inner & ~chain.bridged]] = True
+    used &= ~is_contradicted
+    low, high = chain.spans(graph.edges[merged]).T
+    broken = np.cumsum(chain.broken)
+    repeats = (high - low == 1) & is_contradicted[chain.step_edge[high]]
+    used[merged], is_contradicted[merged] = (broken[low] == broken[high]) & ~repeats, repeats
     probability = expit(found.judged.log_odds)
-    right[chain.loop_edge] = np.where(found.used, probability, np.minimum(probability, UNUSED))
-    chi2[chain.loop_edge] = found.judged.chi2
+    probability = np.where(found.used, probability, np.minimum(probability, UNUSED))
+    used[loops], right[loops], chi2[loops] = found.used[again], probability[again], found.judged.chi2[again]
     poses = np.empty((graph.vertex_count, 4, 4))
     poses[chain.order] = solved[0].poses
-    none = np.zeros_like(used)
-    return Backbone(chain, found, steps, used, right, chi2, solved[1], none, none, poses, doubted, graph.vertex_ids)
-
-
-def _of_all_edges(graph: ViewGraph, backbone: Backbone, one: Fused) -> Backbone:
-    """The backbone of the fused graph `one`, in rows of `graph`; a merged edge is used where none of its steps is
-    broken, a copy where what it is fused into is.
-    """
-    chain, rows = backbone.chain, np.append(one.rows, -1)
-    chain = replace(chain, step_edge=rows[chain.step_edge], loop_edge=one.rows[chain.loop_edge])
-    chain, again, one = _with_copies(chain, one)
-    steps, used, merged, contradicted = np.zeros((4, graph.edge_count), bool)
-    right, chi2 = np.full((2, graph.edge_count), np.nan)
-    steps[one.rows], used[one.rows] = backbone.steps, backbone.used
-    right[one.rows], chi2[one.rows] = backbone.right, backbone.chi2
-    for value in (used, right, chi2):
-        value[one.copies] = value[one.copied]
-    merged[one.merged] = steps[one.merged] = contradicted[one.contradicted] = True
-    used &= ~(steps & contradicted)
-    contradicted &= ~used
-    low, high = chain.spans(graph.edges[one.merged]).T
-    broken = np.cumsum(chain.broken)
-    repeats = (high - low == 1) & contradicted[chain.step_edge[high]]
-    used[one.merged], contradicted[one.merged] = (broken[low] == broken[high]) & ~repeats, repeats
-    return replace(
-        backbone,
-        chain=chain,
-        steps=steps,
-        used=used,
-        right=right,
-        chi2=chi2,
-        loop_width=backbone.loop_width[again] * np.sqrt(np.bincount(again)[again]),
-        merged=merged,
-        contradicted=contradicted,
+    return Backbone(
+        chain,
+        found,
+        steps,
+        used,
+        right,
+        chi2,
+        loop_width=solved[1][again] * np.sqrt(np.bincount(again)[again]),
+        merged=is_merged,
+        contradicted=is_contradicted,
+        world_from_cam=poses,
+        doubted=doubted,
+        vertex_ids=graph.vertex_ids,
     )
-
-
-def _with_copies(chain: Chain, one: Fused) -> tuple[Chain, Ints, Fused]:
-    """The chain with copies as loops of their own, which of its loops each is (M',), and the fused graph whose copies
-    are of loops alone: those of loops that a window took are merged or contradicted as these are.
-    """
-    place = dict(zip(chain.loop_edge.tolist(), range(len(chain.loop_edge)), strict=True))
-    is_loop = np.isin(one.copied, chain.loop_edge)
-    again = np.array([*place.values(), *(place[row] for row in one.copied[is_loop].tolist())], np.int64)
-    merged, contradicted = (
-        np.concatenate([rows, one.copies[np.isin(one.copied, rows)]]) for rows in (one.merged, one.contradicted)
-    )
-    copies, copied = one.copies[is_loop], one.copied[is_loop]
-    one = replace(one, merged=merged, contradicted=contradicted, copies=copies, copied=copied)
-    return replace(chain.with_loops(again, chain.ends[again]), loop_edge=np.append(chain.loop_edge, copies)), again, one
 
 
 def of_every_loop(graph: ViewGraph, backbone: Backbone, trusted: Bools) -> Backbone:
