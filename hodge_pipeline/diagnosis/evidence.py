@@ -170,7 +170,7 @@ def gather(graph: ViewGraph, options: DiagnosisOptions) -> tuple[Evidence, Cycle
         cycles = judge_cycles(loops, *errors, noise, reach_m)
     support = closing_support(cycles, prior)
     weight = prior / (1 - prior) * (0.5 + support) / (1 + support)
-    weight *= 1 + TIE_BREAK * np.random.default_rng(options.seed).random(len(weight))
+    weight *= 1 + TIE_BREAK * np.random.default_rng(0).random(len(weight))
     known = replace(there, information=noise.information)
     found = Evidence(known, noise, reach_m, prior, support, loops.missing(len(edges)), weight, exhaustive)
     return found, cycles, point
