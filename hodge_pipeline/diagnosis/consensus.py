@@ -1,9 +1,9 @@
 """The solution that most edges agree with, and the probability that each edge is right, given that solution.
 
-Greedy merging can mistake a place for another that looks like it, and no single move then leads back. Where every pair
-was tried and the order of views tells of edges, pieces grow from the paths of consecutive views, which are wrong more
-rarely; then parts are moved, and the pieces that result are merged on. Elsewhere those paths are a second start, and a
-third one begins with chordal poses of all edges, from which edges beyond the gate are dropped.
+Greedy merging can mistake a place for another that looks like it, and no single move then leads back. So a second start
+begins with the paths of consecutive views, which are wrong more rarely. Where every pair was tried, the local search
+begins at both, the pieces that result are merged on, and the solution with the larger log-evidence is taken. Elsewhere
+a third start begins with chordal poses of all edges, from which edges beyond the gate are dropped.
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ from scipy.special import expit
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import Alignment, align
+from hodge_pipeline.diagnosis.placement import arrangement_log_evidence
 from hodge_pipeline.diagnosis.robust_poses import ANNEALED, GATE, LARGE, ONCE, TWICE, Solved, fit
+from hodge_pipeline.diagnosis.scene_model import learn_scene_model
 from hodge_pipeline.diagnosis.search import LARGEST, searched
 from hodge_pipeline.types import Floats
 
@@ -31,12 +33,10 @@ EVERY = 1e9
 
 def find_consensus(evidence: Evidence) -> Solved:
     """The solution that most edges agree with."""
-    if not evidence.exhaustive:
-        return _mended(evidence, align(evidence))
-    start = fit(evidence, _in_order(evidence) if np.ptp(evidence.prior) else align(evidence), TWICE)
-    if evidence.graph.vertex_count > LARGEST:
-        return start
-    return fit(evidence, align(evidence, searched(evidence, start)), ONCE)
+    grown = align(evidence)
+    if evidence.exhaustive:
+        return best_arrangement(evidence, fit(evidence, grown, TWICE))
+    return _mended(evidence, grown)
 
 
 def sought_from(evidence: Evidence, best: Solved, start: Floats) -> Solved:
@@ -55,6 +55,20 @@ def agreeing(evidence: Evidence, found: Solved) -> Floats:
     prior = evidence.prior
     logit = np.log(clipped / (1 - clipped)) + PRIOR_SHARE * np.log(prior / (1 - prior))
     return np.asarray(expit(logit))
+
+
+def best_arrangement(evidence: Evidence, start: Solved) -> Solved:
+    """The solution with the largest log-evidence, searched from `start` and from the paths of consecutive views;
+    `start` itself where there are more than `LARGEST` views.
+    """
+    if not 2 < evidence.graph.vertex_count <= LARGEST:
+        return start
+    in_order = fit(evidence, _in_order(evidence), TWICE)
+    starts = (start,) if np.array_equal(start.used, in_order.used) else (start, in_order)
+    found = [fit(evidence, align(evidence, searched(evidence, begun)), ONCE) for begun in starts]
+    models = [learn_scene_model(evidence, one) for one in found]
+    values = [sum(arrangement_log_evidence(evidence, one, model) for model in models) for one in found]
+    return found[int(np.argmax(values))]
 
 
 def _mended(evidence: Evidence, grown: Alignment) -> Solved:

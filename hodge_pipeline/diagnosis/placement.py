@@ -1,5 +1,8 @@
 """Log-evidence for the relative placement of two sets of views: a function of sums over the pairs that a cut separates.
 
+The log-evidence of each camera's upright orientation is added. That of a whole arrangement is the sum over its views,
+each against all others.
+
 Edges that agree on one placement are one event, since places that look alike give many wrong edges that agree: they
 count by the logarithm of their number. Where every pair was tried, a scene model adds evidence: pairs of views that
 would overlap and have no edge are against a placement, consecutive views near each other for it.
@@ -148,3 +151,10 @@ def consecutive_log_evidence(evidence: Evidence) -> Floats:
     """Log-evidence (E,) of each edge, if it joins consecutive views, by its prior odds and closing cycles."""
     odds = evidence.prior / (1 - evidence.prior) * (evidence.support + UNSUPPORTED) / SUPPORTED
     return np.asarray(np.log1p(odds))
+
+
+def arrangement_log_evidence(evidence: Evidence, found: Solved, model: SceneModel) -> float:
+    """Log-evidence for a solution of a scene in which every pair was tried: of each view where all others are."""
+    here, count = Placements.of(evidence, found, model), len(found.piece)
+    of_views = log_evidence(here.current_layers.reshape(3, count, count).sum(axis=1))
+    return float((of_views + here.held(found.poses[:, :3, :3], here.up)).sum())
