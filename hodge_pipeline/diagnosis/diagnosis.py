@@ -19,13 +19,7 @@ from hodge_pipeline.diagnosis.evidence import Evidence, every_pair_tried, gather
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.on_backbone import judged_on_backbone
 from hodge_pipeline.diagnosis.options import CONSISTENT_FROM, WRONG_BELOW, DiagnosisOptions
-from hodge_pipeline.diagnosis.result import (
-    CONSISTENT,
-    SUSPECT,
-    UNTESTABLE,
-    WRONG,
-    Diagnosis,
-)
+from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.robust_poses import Solved
 from hodge_pipeline.diagnosis.robust_priors import priors_told
 from hodge_pipeline.diagnosis.shared_blame import share_blame

@@ -12,13 +12,7 @@ from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.cycles import WITNESSES, Cycles
 from hodge_pipeline.diagnosis.options import WRONG_BELOW
-from hodge_pipeline.diagnosis.result import (
-    CONSISTENT,
-    SUSPECT,
-    UNTESTABLE,
-    WRONG,
-    Diagnosis,
-)
+from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.wording import distance
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.trust import Backbone
