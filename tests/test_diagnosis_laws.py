@@ -242,7 +242,7 @@ def test_what_the_information_states_holds_where_the_poses_are_and_not_where_the
     assert diagnose(graph).kept.all()
 
 
-def test_the_same_seed_gives_the_same_answer() -> None:
+def test_the_same_graph_gives_the_same_answer() -> None:
     graph, _ = spoiled(measured(poses_on_a_ring(16), near_pairs(16, 4)), np.arange(0, 60, 3))
     first, second = diagnose(graph, QUICK), diagnose(graph, QUICK)
     np.testing.assert_array_equal(first.probability, second.probability)

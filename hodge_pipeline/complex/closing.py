@@ -32,12 +32,7 @@ def cycle_errors(loops: Loops, i_from_j: Floats) -> tuple[Floats, Floats]:
     """The closing error of each cycle: angle (L,), radians, and displacement (L,) at the centre of its first frames,
     metres.
     """
-    return errors_of_products(loop_products(loops, i_from_j), loops, i_from_j)
-
-
-def errors_of_products(products: Floats, loops: Loops, i_from_j: Floats) -> tuple[Floats, Floats]:
-    """`cycle_errors` of cycles whose products of motions (L, 4, 4) are given."""
-    middle = _middles(loops, i_from_j)
+    products, middle = loop_products(loops, i_from_j), _middles(loops, i_from_j)
     displacement_m = np.einsum("lij,lj->li", products[:, :3, :3], middle) + products[:, :3, 3] - middle
     return np.linalg.norm(se3.so3_log(products[:, :3, :3]), axis=1), np.linalg.norm(displacement_m, axis=1)
 

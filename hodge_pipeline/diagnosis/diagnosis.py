@@ -19,13 +19,7 @@ from hodge_pipeline.diagnosis.evidence import Evidence, every_pair_tried, gather
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.on_backbone import judged_on_backbone
 from hodge_pipeline.diagnosis.options import CONSISTENT_FROM, WRONG_BELOW, DiagnosisOptions
-from hodge_pipeline.diagnosis.result import (
-    CONSISTENT,
-    SUSPECT,
-    UNTESTABLE,
-    WRONG,
-    Diagnosis,
-)
+from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.robust_poses import Solved, meets_no_loops
 from hodge_pipeline.diagnosis.robust_priors import priors_told
 from hodge_pipeline.diagnosis.shared_blame import share_blame
@@ -51,7 +45,7 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     """Every edge judged by the cycles it lies in and by the scene that most edges agree on; see `Diagnosis`.
 
     No edge is trusted for its source unless the options say so, or the graph shows that its consecutive edges are a
-    backbone; then see `find_backbone`. Deterministic for a seed. Raises `GraphError` for numbers that are not finite
+    backbone; then see `find_backbone`. Deterministic. Raises `GraphError` for numbers that are not finite
     and edges that name no vertex.
     """
     check_graph(graph)

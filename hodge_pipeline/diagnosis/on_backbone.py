@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hodge_pipeline.complex.closing import errors_of_products
-from hodge_pipeline.complex.cycles import Loops, directed, fundamental_products, spanning_forest
+from hodge_pipeline.complex.closing import cycle_errors
+from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.cycles import WITNESSES, Cycles
 from hodge_pipeline.diagnosis.options import WRONG_BELOW
-from hodge_pipeline.diagnosis.result import (
-    CONSISTENT,
-    SUSPECT,
-    UNTESTABLE,
-    WRONG,
-    Diagnosis,
-)
+from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.wording import distance
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.trust import Backbone
@@ -75,16 +68,9 @@ def _cycles(graph: ViewGraph, backbone: Backbone, in_loop: Bools) -> tuple[Cycle
     order = order[np.cumsum((high - low)[order] + 1) <= MOST_ENTRIES]
     low, high, chords = low[order], high[order], chain.loop_edge[order]
     loops = _around(graph, chain, chords, low, high)
-    steps = chain.step_edge[np.append(in_loop, False)[chain.step_edge]]
-    onward = directed(graph.i_from_j, chords, loops.sign[loops.offsets[:-1]])
-    forest = spanning_forest(graph.edges[steps], graph.vertex_count)
-    forest = replace(forest, edges=np.concatenate([graph.edges[steps], chain.order[np.stack([low, high], axis=1)]]))
-    motions = np.concatenate([graph.i_from_j[steps], onward])
-    products = fundamental_products(forest, motions, np.arange(len(steps), len(motions)))
-    errors = errors_of_products(products, loops, graph.i_from_j)
     row = np.full(graph.edge_count, -1, np.int64)
     row[chords] = np.arange(len(chords))
-    return Cycles(loops, *errors, backbone.chi2[chords], backbone.used[chords]), row
+    return Cycles(loops, *cycle_errors(loops, graph.i_from_j), backbone.chi2[chords], backbone.used[chords]), row
 
 
 def _around(graph: ViewGraph, chain: Chain, chords: Ints, low: Ints, high: Ints) -> Loops:

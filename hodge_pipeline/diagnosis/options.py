@@ -36,4 +36,3 @@ class DiagnosisOptions:
         description="learn from the graph whether vertices that are near in order are more often joined, and expect "
         "such edges to be right more often; none is trusted",
     )
-    seed: int = Field(default=0, ge=0, description="of the order in which edges that weigh the same are tried")

@@ -1,8 +1,7 @@
 """Log-evidence for the relative placement of two sets of views: a function of sums over the pairs that a cut separates.
 
-The log-evidence of a whole arrangement is the sum over greedy merges, the two sets with the largest log-evidence first,
-each one cut. So a hundred wrong edges that agree weigh little more than ten right ones, as when a single set is moved.
-The log-evidence of each camera's upright orientation is added.
+The log-evidence of each camera's upright orientation is added. That of a whole arrangement is the sum over its views,
+each against all others.
 
 Edges that agree on one placement are one event, since places that look alike give many wrong edges that agree: they
 count by the logarithm of their number. Where every pair was tried, a scene model adds evidence: pairs of views that
@@ -22,7 +21,7 @@ from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import PER_FOLD
 from hodge_pipeline.diagnosis.robust_poses import UNSETTLED, Solved
 from hodge_pipeline.diagnosis.scene_model import SceneModel
-from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types import Floats, Ints
 
 FAIR_SHARE, SHARE_SPREAD = 0.75, 0.35
 """Share of the expected edges at which a placement has no evidence either way, and the deviation for full evidence."""
@@ -155,29 +154,7 @@ def consecutive_log_evidence(evidence: Evidence) -> Floats:
 
 
 def arrangement_log_evidence(evidence: Evidence, found: Solved, model: SceneModel) -> float:
-    """Log-evidence for a solution of a scene in which every pair was tried."""
+    """Log-evidence for a solution of a scene in which every pair was tried: of each view where all others are."""
     here, count = Placements.of(evidence, found, model), len(found.piece)
-    together = found.piece[:, None] == found.piece[None]
-    np.fill_diagonal(together, False)
-    layers = here.current_layers.reshape(3, count, count)
-    held = here.held(found.poses[:, :3, :3], here.up)
-    return float(held.sum()) + _merged((layers + layers.swapaxes(1, 2)) / 2, together)
-
-
-def _merged(sums: Floats, possible: Bools) -> float:
-    """Log-evidence summed over greedy merges of views, the largest first; `sums (3, V, V)`: layers of all pairs, which
-    merges add up; `possible (V, V)`: pairs of one piece.
-    """
-    count, total = sums.shape[1], 0.0
-    value = np.where(possible, log_evidence(sums), -np.inf)
-    for _ in range(count - 1):
-        first, second = divmod(int(np.argmax(value)), count)
-        if np.isneginf(value[first, second]):
-            break
-        total += float(value[first, second])
-        sums[:, first] += sums[:, second]
-        sums[:, :, first] += sums[:, :, second]
-        value[second] = value[:, second] = -np.inf
-        merged = log_evidence(sums[:, first])
-        value[first] = value[:, first] = np.where(np.isneginf(value[first]), -np.inf, merged)
-    return total
+    of_views = log_evidence(here.current_layers.reshape(3, count, count).sum(axis=1))
+    return float((of_views + here.held(found.poses[:, :3, :3], here.up)).sum())

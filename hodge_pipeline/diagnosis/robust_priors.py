@@ -39,10 +39,9 @@ def right_priors(graph: ViewGraph, priors: Priors, solved: Callable[[ViewGraph],
     priors = as_solved(graph, priors)
     axes = _axes(priors)
     every, weights = np.ones(len(axes), bool), np.ones(len(axes))
-    gate, middle = np.zeros((2, len(axes)))
-    for size in np.unique(axes[axes > 0]).tolist():
-        gate[axes == size] = tail_gate(size, min(LEAST_SHARE, 1 / len(axes)))
-        middle[axes == size] = chdtri(size, 0.5)
+    size = np.maximum(axes, 1)  # a prior that states nothing has a χ² of 0
+    gate = np.array([tail_gate(each, min(LEAST_SHARE, 1 / len(axes))) for each in size.tolist()])
+    middle = np.asarray(chdtri(size, 0.5))
     for _ in range(ROUNDS):
         weighted = replace(priors, information=weights[:, None, None] * priors.information)
         chi2 = chi2_of_priors(graph, priors, solved(replace(graph, priors=weighted)))

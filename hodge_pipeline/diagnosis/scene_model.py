@@ -26,8 +26,6 @@ USUAL, SPREAD = np.array([6.0, np.log(2.5), np.log(2.7)]), np.array([2.0, 0.5, 0
 """The means of the prior on the parameters of `Joining`, and their standard deviations."""
 LEAST_SPREAD_RAD = 0.2
 """Least spread of up: chained poses drift by as much, however upright the cameras were."""
-FEWEST = 6
-"""Fewest views of a group that the model is fitted to: the unknown up of a smaller one fits too well."""
 ROUNDS, STEPS = 8, 5
 """Iterations of the fit, and of the up of each group: limits on cost."""
 CLEAR_SHARE, CLEAR_SPREAD_RAD = 0.8, 0.42
@@ -121,24 +119,16 @@ class Upright:
 
 
 def learn_upright(rotations: Floats, neighbours: Ints) -> Upright:
-    """The model of cameras (V, 3, 3) in groups (V,) of neighbours; its share is 0 where these do not confirm it.
+    """The most probable model of cameras (V, 3, 3) in groups (V,) of neighbours, by expectation and maximisation from
+    several starts; its share is 0 where the groups do not confirm it.
 
     Pieces may be placed wrongly, so that all cameras together fit none; and cameras that turn freely may fit one by
     chance. Groups of neighbours do neither.
     """
-    model = _fitted(rotations, neighbours)
+    found = [_fitted_from(Upright(up, LEAST_SPREAD_RAD**-2 / 4, 0.5), rotations, neighbours) for up in STARTS]
+    model = max(found, key=lambda each: each[0])[1]
     clear = model.share >= CLEAR_SHARE and model.concentration >= CLEAR_SPREAD_RAD**-2
     return model if clear else replace(model, share=0.0)
-
-
-def _fitted(rotations: Floats, piece: Ints) -> Upright:
-    """The most probable model, by expectation and maximisation from several starts."""
-    size = np.bincount(piece)[piece]
-    enough = (size >= FEWEST) | (size == size.max())
-    rotations = rotations[enough]
-    piece = np.unique(piece[enough], return_inverse=True)[1].reshape(-1)
-    found = [_fitted_from(Upright(up, LEAST_SPREAD_RAD**-2 / 4, 0.5), rotations, piece) for up in STARTS]
-    return max(found, key=lambda each: each[0])[1]
 
 
 def _fitted_from(model: Upright, rotations: Floats, piece: Ints) -> tuple[float, Upright]:

@@ -48,13 +48,11 @@ UNIT, PINNED_NATS = 1000, 1e5
 
 @dataclass(frozen=True)
 class Move:
-    """A `motion (4, 4)` of the views `inside (V,)` into a piece, `beside` views there, and the log-evidence gained."""
+    """The views `inside (V,)` that move as a trial proposes, and the log-evidence gained."""
 
     gain: float
     inside: Bools
-    motion: Floats
-    piece: int
-    beside: Ints
+    trial: Trial
 
 
 def searched(evidence: Evidence, found: Solved) -> Solved:
@@ -77,7 +75,8 @@ def _applied(found: Solved, moves: list[Move]) -> Alignment:
     """The alignment after the moves."""
     poses, piece = found.poses.copy(), found.piece.copy()
     for move in moves:
-        poses[move.inside], piece[move.inside] = move.motion @ poses[move.inside], move.piece
+        poses[move.inside] = move.trial.motion @ poses[move.inside]
+        piece[move.inside] = move.trial.piece
     return Alignment(piece, poses)
 
 
@@ -99,7 +98,8 @@ def _moves(here: Placements) -> list[Move]:
     moves: list[Move] = []
     together = max(TOGETHER // max(len(here.pairs), 1), 1)
     for first in range(0, len(tried), together):
-        moves += _best_moves(here, Trial.of(here, proposals, tried[first : first + together]))
+        trials = Trial.of(here, proposals, tried[first : first + together])
+        moves += [_best_move(here, *each) for each in zip(trials, _cuts(here, trials), strict=True)]
     least = LEAST_GAIN if evidence.exhaustive else LEAST_OF_FEW
     better = sorted((move for move in moves if move.gain > least), key=lambda move: -move.gain)
     return _independent(better, len(here.found.piece))
@@ -109,9 +109,9 @@ def _independent(moves: list[Move], count: int) -> list[Move]:
     """The moves (best first) whose views, and the views beside them, no better move involves."""
     moved, stays, chosen = np.zeros(count, bool), np.zeros(count, bool), []
     for move in moves:
-        if not ((moved | stays) & move.inside).any() and not moved[move.beside].any():
+        if not ((moved | stays) & move.inside).any() and not moved[move.trial.beside].any():
             moved |= move.inside
-            stays[move.beside] = True
+            stays[move.trial.beside] = True
             chosen.append(move)
     return chosen
 
@@ -147,14 +147,11 @@ class Trial:
         return out
 
 
-def _best_moves(here: Placements, trials: list[Trial]) -> list[Move]:
-    """The best set of views to move for each trial."""
-    out = []
-    for trial, sets in zip(trials, _cuts(here, trials), strict=True):
-        gains = [_gain(here, trial, inside) for inside in sets]
-        best = int(np.argmax(gains))
-        out.append(Move(gains[best], sets[best], trial.motion, trial.piece, trial.beside))
-    return out
+def _best_move(here: Placements, trial: Trial, sets: Bools) -> Move:
+    """The best of these sets (C, V) of views to move."""
+    gains = [_gain(here, trial, inside) for inside in sets]
+    best = int(np.argmax(gains))
+    return Move(gains[best], sets[best], trial)
 
 
 def _gain(here: Placements, trial: Trial, inside: Bools) -> float:

@@ -17,6 +17,7 @@ from hodge_pipeline.types.notes import Note, notes_of
 FRAMES_IN_BLOCK = 16
 """Frames whose clouds a worker makes, and holds, at once."""
 LISTED_NOTES = 5
+"""Frames with the same note that are named; more are counted."""
 FACTOR_OF_UNITS = 50.0
 """Scans of one scene differ less in reach; millimetres and metres differ by 1000."""
 BLANK = "its depth is sound, but its colour image shows nothing: black, or of one even colour"

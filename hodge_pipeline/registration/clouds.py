@@ -25,7 +25,8 @@ MANY_POINTS = 5_000_000
 """Measurements of a frame from which it is told that the cloud keeps fewer: more than a depth image has."""
 MAP_AWAY = 10.0
 """A cloud whose median range is this many times its extent is in map coordinates, not in the sensor's axes."""
-MAX_VOXELS_ALONG_AXIS = 2_000_000  # its cube still fits the 64-bit voxel key
+MAX_VOXELS_ALONG_AXIS = 2_000_000
+"""Its cube still fits the 64-bit key of a voxel."""
 BLANK_LEVELS = 6
 """Grey levels of 255 that a blank image spans at most: a covered camera's span 5 with a noise of 2 levels. Images of
 fr1/rpy, fr1/xyz, red kitchen, ICL-NUIM and rendered rooms span 113 and more, 11 at a tenth of their brightness."""

@@ -16,6 +16,7 @@ LONGEST_USUAL = 10.0
 NO_HOLE_S = 0.2
 """The step of a video of 5 frames a second, over which tracking holds."""
 GAPS_TOLD = 5
+"""Holes that a note names, which then fits a line."""
 
 
 def longest_usual_step_s(stamps_s: Floats) -> float:

@@ -29,6 +29,7 @@ bends motions more; with 0.35 fr1/rpy's every second frame, whose velocities are
 GATE_PIXEL_SIGMA = 1.5
 """Pixels: sigma of an inlier's error for the gate, blur and a camera that turns fast included."""
 STEPS = 8
+"""Of least squares on the inliers, at most: a limit on cost."""
 ON_A_LINE = 1e-6
 """Area of a triangle, over the square of its size, below which rounding decides on its plane."""
 

@@ -43,8 +43,8 @@ kept for 38. And the nats that a shift which they share must gain, more than cha
 STRAINED, TORN = 0.03, 0.5
 """Shares of the runs of steps which loops bend by more than 1 % of right loops do: three times as many, from which on
 the loops are compared with the same loops elsewhere; and most of them, which right loops never bend so. In six graphs
-of SLAM and 170 simulated ones right loops bend 0 to .05; wrong ones in groups of ten .05 to .11, and where they fold the
-path .99.
+of SLAM and 170 simulated ones right loops bend 0 to .05; wrong ones in groups of ten .05 to .11, and .99 where they
+fold the path.
 """
 MOVED = 5
 """Times that loops are moved elsewhere."""
