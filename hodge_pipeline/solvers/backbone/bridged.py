@@ -110,11 +110,7 @@ def _bridged(
         as_stated = _as_stated(chain, found, judge)
     # a break found by unconfirmed loops is not confirmed either
     for one, other in [(chain, found)] if found is first else [(chain, found), (unbroken, first)]:
-        strain = other.scales.strain(one, other.used, other.linear)
-        if not other.confirmed or strain > TORN:
-            continue
-        doubtful = strain > STRAINED or _contradicted(other)
-        if not (doubtful and _elsewhere_do_as_well(one, other, trusted, judge)):
+        if other.confirmed and _stands(one, other, trusted, judge):
             return one, other
     return unbroken, refused(first, trusted)
 
@@ -173,6 +169,16 @@ def _without_shift(
     if again is None or not again.confirmed or again.log_evidence < same.log_evidence:
         again = same
     return apart, again, rows
+
+
+def _stands(chain: Chain, found: Inferred, trusted: Bools, judge: Callable[..., Inferred | None]) -> bool:
+    """Whether confirmed loops bend the path no more than right ones do, and chance does not explain them: wrong loops
+    between places that look the same fold a path upon itself, and bend a weak odometry from one place to the next.
+    """
+    strain = found.scales.strain(chain, found.used, found.linear)
+    if strain <= STRAINED and not _contradicted(found):
+        return True
+    return strain <= TORN and not _elsewhere_do_as_well(chain, found, trusted, judge)
 
 
 def _contradicted(found: Inferred) -> bool:

@@ -87,16 +87,18 @@ def elsewhere(chain: Chain, moved: Bools, rng: np.random.Generator) -> Chain:
     first = np.searchsorted(chain.path, chain.path[drawn[nearest]])
     last = np.searchsorted(chain.path, chain.path[drawn[nearest]], side="right") - 1
     ends[rows] = np.clip(drawn[nearest] + chain.ends[rows] - chain.ends[one][nearest], first, last)
+    alone = ends[:, 0] == ends[:, 1]  # moved to where a path ends
+    ends[alone] = chain.ends[alone]
     motion, of = chain.motion.copy(), one[nearest]
-    off = chain.between(_as_another(chain, chain.ends, rows, of, chain.motion), chain.motion[rows])
-    motion[rows] = chain.compose(_as_another(chain, ends, rows, of, chain.motion), off)
+    off = chain.between(_as_another(chain, chain.ends, rows, of), chain.motion[rows])
+    motion[rows] = _as_another(chain, ends, rows, of) @ off
     turned = ends[:, 0] > ends[:, 1]
     motion[turned] = se3.inverse(motion[turned])
     return replace(chain, ends=np.sort(ends, axis=1), motion=motion)
 
 
-def _as_another(chain: Chain, ends: Ints, rows: Ints, others: Ints, motion: Floats) -> Floats:
+def _as_another(chain: Chain, ends: Ints, rows: Ints, others: Ints) -> Floats:
     """The motions (K, 4, 4) of loops `rows (K,)` with these ends (M, 2) by those of `others (K,)`, along the steps."""
     poses, ((i, j), (a, b)) = chain.poses, (ends[rows].T, ends[others].T)
     before, after = chain.between(poses[i], poses[a]), chain.between(poses[b], poses[j])
-    return chain.compose(chain.compose(before, motion[others]), after)
+    return np.asarray(before @ chain.motion[others] @ after)

@@ -11,10 +11,9 @@ import numpy as np
 
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE
-from hodge_pipeline.solvers.backbone.fit import Fit, optimised, thinned
+from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, optimised, thinned
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
-from hodge_pipeline.solvers.backbone.places import MOST_STEPS
 from hodge_pipeline.types import Bools, Floats, Ints
 
 LEAST_NAMED = float(np.log(1.07))
