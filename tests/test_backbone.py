@@ -381,7 +381,7 @@ def test_more_loops_than_can_be_inverted_are_judged_at_the_poses_of_some(monkeyp
     right = np.flatnonzero(made.right[chain.loop_edge])
     some = fit.thinned(chain, right)
     assert 0 < len(some.active) < len(right)
-    assert some.network.core_size * 6 <= 150
+    assert (some.network.plan.size - some.network.plan.core) * 6 <= 150
     found = find_backbone(made.graph)
     assert found is not None
     assert not (found.used & ~made.right).any()
