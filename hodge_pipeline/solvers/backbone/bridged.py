@@ -14,11 +14,19 @@ from hodge_pipeline.solvers.backbone.breaks import Break, Runs, agreed_breaks, u
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mixture
 from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, optimised
-from hodge_pipeline.solvers.backbone.inference import Inferred, by_chance, infer, refused, refused_alike, without
+from hodge_pipeline.solvers.backbone.inference import (
+    Inferred,
+    agree_anywhere,
+    by_chance,
+    infer,
+    refused,
+    refused_alike,
+    without,
+)
 from hodge_pipeline.solvers.backbone.judge import densities
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
-from hodge_pipeline.solvers.backbone.mistakes import elsewhere, shared_shift, without_shift
+from hodge_pipeline.solvers.backbone.mistakes import shared_shift, without_shift
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.places import MISTAKEN, MISTAKEN_PLACES, agreeing_groups
 from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
@@ -41,14 +49,8 @@ SMALLER, OF_A_SHIFT = (1 / 4, 1 / 16), 3 * BY_CHANCE
 """Factors on the learned errors by which mistaken loops are found; with the smaller alone 286 wrong ones of `alike` are
 kept for 38. And the nats that a shift which they share must gain, more than chance for each of its axes.
 """
-STRAINED, TORN = 0.03, 0.5
-"""Shares of the runs of steps which loops bend by more than 1 % of right loops do: three times as many, from which on
-the loops are compared with the same loops elsewhere; and most of them, which right loops never bend so. In six graphs
-of SLAM and 170 simulated ones right loops bend 0 to .05; wrong ones in groups of ten .05 to .11, and .99 where they
-fold the path.
-"""
 DRAWN = 3
-"""Times that loops are moved elsewhere, or their motions drawn at random."""
+"""Times that the motions of loops are drawn at random."""
 
 
 def infer_bridged(
@@ -111,7 +113,9 @@ def _bridged(
         as_stated = _as_stated(chain, found, judge)
     # a break found by unconfirmed loops is not confirmed either
     for one, other in [(chain, found)] if found is first else [(chain, found), (unbroken, first)]:
-        if other.confirmed and _stands(one, other, trusted, judge):
+        if not other.confirmed or agree_anywhere(other, outliers):
+            continue
+        if not (_contradicted(other) and _random_motions_do_as_well(one, other, trusted, judge)):
             return one, other
     return unbroken, refused(first, trusted)
 
@@ -170,23 +174,6 @@ def _without_shift(
     if again is None or not again.confirmed or again.log_evidence < same.log_evidence:
         again = same
     return apart, again, rows
-
-
-def _stands(chain: Chain, found: Inferred, trusted: Bools, judge: Callable[..., Inferred | None]) -> bool:
-    """Whether confirmed loops bend the path no more than right ones do, and chance does not explain them."""
-    strain = found.scales.strain(chain, found.used, found.linear)
-    if strain > TORN or strain > STRAINED and _elsewhere_do_as_well(chain, found, trusted, judge):
-        return False
-    return not (_contradicted(found) and _random_motions_do_as_well(chain, found, trusted, judge))
-
-
-def _elsewhere_do_as_well(chain: Chain, found: Inferred, trusted: Bools, judge: Callable[..., Inferred | None]) -> bool:
-    """Whether the loops but for `trusted (M,)` ones, those of each place moved to two others, reach half of the
-    log-evidence: a weak odometry bends from each mistaken place to the next, whichever they are.
-    """
-    rng = np.random.default_rng(4)
-    moved = (judge(elsewhere(chain, ~trusted, rng), scales=found.scales) for _ in range(DRAWN))
-    return any(other is not None and 2 * other.log_evidence > found.log_evidence for other in moved)
 
 
 def _contradicted(found: Inferred) -> bool:

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import STUDENT_99
@@ -14,7 +13,7 @@ from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis
 from hodge_pipeline.solvers.backbone.judge import by_path
 from hodge_pipeline.solvers.backbone.linear import Linear
-from hodge_pipeline.solvers.backbone.loop_places import loops_at_place, one_of_each_place
+from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.types import Bools, Floats, Ints
 
@@ -71,34 +70,3 @@ def without_shift(chain: Chain, poses: Floats, rows: Ints, shift: Floats) -> Cha
     aside[:3, 3] = shift
     motion[rows] -= se3.inverse(poses[chain.ends[rows, 0]]) @ aside
     return replace(chain, motion=motion)
-
-
-def elsewhere(chain: Chain, moved: Bools, rng: np.random.Generator) -> Chain:
-    """The chain with the `moved (M,)` loops at other places drawn at random: those of one place move together, and
-    agree with each other as they did.
-    """
-    rows = np.flatnonzero(moved)
-    if not len(rows):
-        return chain
-    one = rows[one_of_each_place(chain.places[rows])]
-    nearest = cKDTree(chain.places[one]).query(chain.places[rows], p=np.inf)[1]
-    ends = chain.ends.copy()
-    drawn = rng.integers(0, chain.size, (len(one), 2))
-    first = np.searchsorted(chain.path, chain.path[drawn[nearest]])
-    last = np.searchsorted(chain.path, chain.path[drawn[nearest]], side="right") - 1
-    ends[rows] = np.clip(drawn[nearest] + chain.ends[rows] - chain.ends[one][nearest], first, last)
-    alone = ends[:, 0] == ends[:, 1]  # moved to where a path ends
-    ends[alone] = chain.ends[alone]
-    motion, of = chain.motion.copy(), one[nearest]
-    off = chain.between(_as_another(chain, chain.ends, rows, of), chain.motion[rows])
-    motion[rows] = _as_another(chain, ends, rows, of) @ off
-    turned = ends[:, 0] > ends[:, 1]
-    motion[turned] = se3.inverse(motion[turned])
-    return replace(chain, ends=np.sort(ends, axis=1), motion=motion)
-
-
-def _as_another(chain: Chain, ends: Ints, rows: Ints, others: Ints) -> Floats:
-    """The motions (K, 4, 4) of loops `rows (K,)` with these ends (M, 2) by those of `others (K,)`, along the steps."""
-    poses, ((i, j), (a, b)) = chain.poses, (ends[rows].T, ends[others].T)
-    before, after = chain.between(poses[i], poses[a]), chain.between(poses[b], poses[j])
-    return np.asarray(before @ chain.motion[others] @ after)

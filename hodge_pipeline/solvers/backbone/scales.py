@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
-from hodge_pipeline.complex.chi2 import STUDENT_99
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.credible import MOST_OF_A_STEP
 from hodge_pipeline.solvers.backbone.evidence import (
@@ -22,10 +21,10 @@ from hodge_pipeline.solvers.backbone.evidence import (
     mixture,
     student_log_density,
 )
-from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, optimised, thinned
-from hodge_pipeline.solvers.backbone.linear import Linear, linearise
+from hodge_pipeline.solvers.backbone.fit import Fit
+from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
-from hodge_pipeline.types import Bools, Floats, Ints
+from hodge_pipeline.types import Floats, Ints
 
 FOLD = np.log(4.0)
 """Prior standard deviation of the logarithm of a scale: stated information is seldom wrong by more."""
@@ -127,26 +126,6 @@ class Scales:
         if chain.stated:
             turn, shift = min(turn, shift + MOST_RATIO), min(shift, turn + MOST_RATIO)
         return Scales(*np.exp([turn, shift, *own]).tolist())
-
-    def strain(self, chain: Chain, used: Bools, linear: Linear) -> float:
-        """The share of the runs of steps between used loops (M,) that these bend by more than 1 % of right loops do, at
-        poses near `linear`. Errors are as stated, or larger by these scales, and up to twice as large again where their
-        median is, since scales are learned so coarsely. 0 where nothing is stated.
-        """
-        if not chain.stated or not used.any():
-            return 0.0
-        least = Scales(*(max(each, 1.0) for each in astuple(self)))
-        fit = least.fitted(chain, used, linear)
-        here = zip(astuple(least), astuple(least.at_solution(fit)), strict=True)
-        larger = Scales(*(min(max(one, other), one * float(np.exp(DIFFERENT))) for one, other in here))
-        fit = larger.fitted(chain, used, fit.linear)
-        chi2 = mahalanobis(*fit.left_out(fit.reduced.of_runs))[0]
-        return float((chi2 > STUDENT_99[len(chain.axes)]).mean()) if len(chi2) else 0.0
-
-    def fitted(self, chain: Chain, used: Bools, linear: Linear) -> Fit:
-        """The fit of the used loops (M,) of a chain with these scales, from the poses of `linear` on."""
-        scaled = self.applied(chain)
-        return optimised(Fit(thinned(scaled, np.flatnonzero(used)), replace(linear, chain=scaled)), MOST_STEPS)
 
     def units(self, chain: Chain) -> tuple[Floats, Floats]:
         """The factor on each free axis (p,), of steps and of loops."""
