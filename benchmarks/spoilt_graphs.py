@@ -51,6 +51,7 @@ INJECTED = (
     ("kitti_00", 100),
     ("parking-garage", 500),
 )
+REPLACED = ("intel", "CSAIL", "kitti_00", "kitti_05", "manhattan", "MIT")
 GROUPS = (1, 10)
 MISTAKES = ("displaced", "turned round", "shortened", "inverted")
 NOISE = np.repeat([0.005, 0.02], 3)
@@ -137,6 +138,19 @@ def classical_cases(seed: int) -> Iterator[Case]:
             more, motions = wrong_loops(poses, count, group, rng, flat=flat)
             right = np.arange(len(graph.edges) + len(more)) < len(graph.edges)
             yield Case(f"{name} +{count} by {group}", with_edges(graph, more, motions), poses[:, :3, 3], right)
+
+
+def replaced_cases(seed: int) -> Iterator[Case]:
+    """Every loop replaced by a wrong one, alone or in groups that agree: two places taken for the same."""
+    for name in REPLACED:
+        whole = load(GRAPHS / "sesync" / f"{name}.g2o")
+        poses, odometry = own_optimum(whole), whole.select(np.flatnonzero(steps(whole)))
+        count, flat = whole.edge_count - odometry.edge_count, bool(np.ptp(poses[:, 2, 3]) < 1e-6)
+        for group in GROUPS:
+            rng = np.random.default_rng([seed, group])
+            graph = with_edges(odometry, *wrong_loops(poses, count, group, rng, flat=flat))
+            right = np.arange(graph.edge_count) < odometry.edge_count
+            yield Case(f"{name}, {count} wrong by {group}", graph, poses[:, :3, 3], right)
 
 
 def clean_cases(seed: int) -> Iterator[Case]:
@@ -357,6 +371,7 @@ def session_cases(seed: int) -> Iterator[Case]:
 KINDS = {
     "random": random_cases,
     "breaks": broken_cases,
+    "replaced": replaced_cases,
     "classical": classical_cases,
     "clean": clean_cases,
     "simulated": simulated_cases,

@@ -1,6 +1,7 @@
 """What wrong edges do to graphs whose right answer is known: one line for each graph, and sums of each kind.
 
     python -m benchmarks.wrong_loops random              # every loop of the SLAM graphs replaced: the odometry stays
+    python -m benchmarks.wrong_loops replaced            # and of graphs of the literature, by groups that agree
     python -m benchmarks.wrong_loops breaks              # one step of a path broken by 5 m and 30°, at 20 places
     python -m benchmarks.wrong_loops classical           # loops put into graphs of the literature
     python -m benchmarks.wrong_loops clean               # graphs that nobody spoilt: how many edges are blamed

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from backbone_graphs import Drive, at_one_place, drive, field, two_laps
+from backbone_graphs import Drive, at_one_place, drive, field, two_laps, with_weak_steps
 from benchmarks.spoilt_graphs import mistaken_cases
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.refine.pose_graph import read_graph
@@ -98,6 +98,27 @@ def test_places_whose_loops_are_not_confirmed_again_are_not_likely(monkeypatch: 
 def test_wrong_loops_alone_never_move_the_odometry(made: Callable[[], Drive]) -> None:
     graph = made()
     found = diagnose(graph.graph)
+    assert graph.error_m(found.world_from_cam) <= NEVER_WORSE * graph.error_m(graph.odometry())
+
+
+WEAK: dict[str, Any] = dict(count=500, world="town", loops=0, wrong=0.0)
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        # a weak odometry bends from one mistaken place to the next: 53 m for 34 m
+        lambda: at_one_place(with_weak_steps(drive(seed=1, **WEAK), 0.15, 1), 250, group=10, seed=1),
+        # its drift hides that the poses meet none of the loops
+        lambda: at_one_place(with_weak_steps(drive(seed=1, **WEAK | {"count": 1000}), 0.1, 1), 500, group=10, seed=1),
+        # broken at one step, a path folds until loops between any places agree: 50 m for 2.6 m
+        lambda: at_one_place(drive(seed=2, misstated=(10.0, 1.0), **WEAK | {"count": 700}), 800, seed=2),
+    ],
+)
+def test_no_loop_is_used_where_loops_agree_between_any_places(made: Callable[[], Drive]) -> None:
+    graph = made()
+    found = diagnose(graph.graph)
+    assert not (found.kept & ~graph.right).any()
     assert graph.error_m(found.world_from_cam) <= NEVER_WORSE * graph.error_m(graph.odometry())
 
 

@@ -120,7 +120,7 @@ def without(found: Inferred, chain: Chain, out: Bools, outliers: OutlierModel, t
 
 
 def agree_anywhere(found: Inferred, outliers: OutlierModel) -> bool:
-    """Whether loops agree with the poses between any other places too: a path that wrong loops have folded, or bent from
+    """Whether loops agree with the poses between any other places too: a path that wrong ones have folded, or bent from
     one mistaken place to the next, is small, and its places are near each other.
     """
     chain = found.linear.chain
