@@ -33,6 +33,10 @@ CYCLES_PER_EDGE = 64
 """Triangles kept to an edge, so that memory is bounded."""
 LEAST_DEGREE = 4
 """Least mean degree of a view where all pairs were tried."""
+FARTHEST = 2.0
+"""Largest distance of a working point in median translations: one farther off is the centre of a turn."""
+LEAST_GAIN = 0.3
+"""Share of the median translation that a point must save."""
 TIE_BREAK = 1e-3
 """Random share added to a weight: with equal ones a chain would be merged one edge a round."""
 
@@ -176,19 +180,21 @@ def working_point(i_from_j: Floats, probability: Floats) -> tuple[Floats, float]
     """The point (3,) that likely edges move least, `Z c ≈ c`, and the median distance that they move it, metres.
 
     Overlapping views look at the same things, so that their motion nearly fixes a point in front of them. The origin
-    where no point is better.
+    where no point is clearly better.
     """
     likely = probability >= np.quantile(probability, 0.5) if len(probability) else np.zeros(0, bool)
     rotation, shift = i_from_j[likely, :3, :3] - np.eye(3), i_from_j[likely, :3, 3]
     lengths = np.linalg.norm(shift, axis=1)
     usual = float(np.median(lengths)) if len(lengths) else 1.0
-    if usual == 0 or not len(lengths):
-        return np.zeros(3), 1.0
+    if not len(lengths) or usual == 0:
+        return np.zeros(3), usual or 1.0
     weight, point = np.ones(len(shift)), np.zeros(3)
     for _ in range(ROUNDS):
         normal = np.einsum("n,nij,nik->jk", weight, rotation, rotation) + 1e-3 * weight.sum() * np.eye(3)
         point = np.linalg.solve(normal, -np.einsum("n,nij,ni->j", weight, rotation, shift))
         displacement_m = np.linalg.norm(rotation @ point + shift, axis=1)
         weight = 1 / (1 + (displacement_m / max(float(np.median(displacement_m)), 1e-12)) ** 2)
-    spread = float(np.median(displacement_m))
-    return (point, spread) if spread < usual else (np.zeros(3), usual)
+    spread = float(np.median(np.linalg.norm(rotation @ point + shift, axis=1)))
+    if np.linalg.norm(point) > FARTHEST * usual or spread > (1 - LEAST_GAIN) * usual:
+        return np.zeros(3), usual
+    return point, spread
