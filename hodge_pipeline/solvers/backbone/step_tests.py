@@ -81,7 +81,7 @@ def agreeing_loops(chain: Chain, among: Bools) -> int:
         spread = spread + (chain.step_covariance[low[second]] if down else 0.0)
         spread = spread + (chain.step_covariance[high[first] + max(up, 0)] if up else 0.0)
         chi2 = mahalanobis(chain.log(se3.inverse(motion) @ ahead), spread)[0]
-        closing = closes(motion, ahead, limits) | (chi2 < AS_STATED * len(chain.axes))
+        closing = closes(motion, ahead, limits) | chain.stated & (chi2 < AS_STATED * len(chain.axes))
         out[first[closing]] = out[second[closing]] = True
     return int(out.sum())
 

@@ -52,9 +52,11 @@ def windowed(given: Fused) -> Fused:
     at, near = np.flatnonzero(chain.step_edge >= 0), _near(chain)
     if not _many(chain, near):
         return given
-    unknown = has_unit_information(graph)
+    closing, unknown = _closing(chain, near), has_unit_information(graph)
+    if unknown and 2 * closing.sum() < len(near):  # errors that are learned from wrong edges would explain all
+        return given
     learned = _with_learned_covariance(chain, near) if unknown else chain
-    fits, scale, untested = _fitting(learned, near)
+    fits, scale, untested = _fitting(learned, near, closing)
     near, fits = near[~untested], fits[~untested]
     weights, poses = _agreeing(learned, near, fits, scale)
     (of_step, of_near), agree = np.split(weights, [len(at)]), weights[len(at) :] > 0
@@ -115,15 +117,21 @@ def _with_learned_covariance(chain: Chain, near: Ints) -> Chain:
     return replace(chain, step_covariance=step, covariance=loop)
 
 
-def _fitting(chain: Chain, near: Ints) -> tuple[Bools, float, Bools]:
-    """Which of the `near` loops (K,) agree with the chain; the factor on χ² by which loops err more than stated; and
-    which of the others (K,) are left to the judging of loops: they pass over a step that no loop confirms and none of a
-    short cycle tests. Wrong loops of one place agree with each other, and nothing of a window says otherwise there.
+def _closing(chain: Chain, near: Ints) -> Bools:
+    """Which of the `near` loops (K,) close with the steps as those of right edges do."""
+    low, high = chain.ends[near].T
+    ahead = se3.inverse(chain.poses[low]) @ chain.poses[high]
+    return closes(chain.motion[near], ahead, gate(chain), np.sqrt(high - low))
+
+
+def _fitting(chain: Chain, near: Ints, closing: Bools) -> tuple[Bools, float, Bools]:
+    """Which of the `near` loops (K,) agree with the chain; the factor on χ² by which loops err more than stated, from
+    those `closing (K,)`; and which of the others (K,) are left to the judging of loops: they pass over a step that no
+    loop confirms and none of a short cycle tests. Wrong loops of one place agree with each other, and nothing of a
+    window says otherwise there.
     """
     linear, ends, size = linearise(chain, chain.poses), chain.ends[near], len(chain.axes)
     chi2 = mahalanobis(linear.loops[0][near], by_path(linear, near))[0]
-    low, high = chain.poses[ends[:, 0]], chain.poses[ends[:, 1]]
-    closing = closes(chain.motion[near], se3.inverse(low) @ high, gate(chain), np.sqrt(np.diff(ends, axis=1)[:, 0]))
     usual = chi2[closing | (chain.stated & (chi2 < AS_STATED * size))]
     usual_scale = float(np.median(usual)) / MEDIAN_CHI2[size] if len(usual) else 1.0
     scale = max(usual_scale, _rounding(chain, near))
