@@ -16,9 +16,9 @@ from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mi
 from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, optimised
 from hodge_pipeline.solvers.backbone.inference import (
     Inferred,
-    agree_anywhere,
     by_chance,
     infer,
+    is_crumpled,
     refused,
     refused_alike,
     without,
@@ -113,7 +113,7 @@ def _bridged(
         as_stated = _as_stated(chain, found, judge)
     # a break found by unconfirmed loops is not confirmed either
     for one, other in [(chain, found)] if found is first else [(chain, found), (unbroken, first)]:
-        if not other.confirmed or agree_anywhere(other, outliers):
+        if not other.confirmed or is_crumpled(other, outliers):
             continue
         if not (_contradicted(other) and _random_motions_do_as_well(one, other, trusted, judge)):
             return one, other

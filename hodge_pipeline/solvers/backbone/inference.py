@@ -9,9 +9,10 @@ from functools import cached_property
 import numpy as np
 from scipy.special import expit
 
+from hodge_pipeline.complex.chi2 import STUDENT_99
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.solvers.backbone.chain import Chain
-from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, EVEN, OutlierModel, mixture
+from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, EVEN, OutlierModel, mahalanobis, mixture
 from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, Reduced, from_rotations, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, densities, judge
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
@@ -119,20 +120,25 @@ def without(found: Inferred, chain: Chain, out: Bools, outliers: OutlierModel, t
     return trial.final(found.used & ~out | trusted, EVEN, linear, found.confirmed, found.of_places)
 
 
-def agree_anywhere(found: Inferred, outliers: OutlierModel) -> bool:
-    """Whether loops agree with the poses between any other places too: a path that wrong ones have folded, or bent from
-    one mistaken place to the next, is small, and its places are near each other.
+def is_crumpled(found: Inferred, outliers: OutlierModel) -> bool:
+    """Whether loops bend the path, and agree with the poses between any other places too: a path that wrong ones have
+    folded, or bent from one mistaken place to the next, is small, and its places are near each other.
     """
-    chain = found.linear.chain
+    fit, chain = Fit(found.reduced, found.linear), found.linear.chain
+    chi2 = mahalanobis(*fit.left_out(fit.reduced.of_runs))[0]
+    if (chi2 > STUDENT_99[len(chain.axes)]).sum() <= BENT * len(chi2):
+        return False
     loop, ends = decoys(chain, -(-CHANCES // len(chain.ends)))
     anywhere = judge(replace(found.linear, chain=chain.with_loops(loop, ends)), None, EVEN, outliers)
     return bool((anywhere.factor > 0).mean() > ANYWHERE)
 
 
-ANYWHERE = 0.6
-"""Share of random places between which loops agree, by the drift of the bare path, beyond which they are wrong. Right
-ones: 0 to .26 in 13 graphs of the literature with as many wrong ones, but MIT, whose odometry is off by 84 m, .45. All
-wrong: .80 to .98 where they were used, in two of these graphs and seven simulated ones.
+BENT, ANYWHERE = 0.02, 0.6
+"""Share of the runs of steps that are bent by more than 1 % of right ones; and share of random places between which
+loops agree, by the drift of the bare path. Beyond both, loops are wrong: .04 to .99 and .80 to .98 where all were wrong
+and used, in three graphs of the literature and seven simulated ones. Right ones: up to .26 of random places in 13
+graphs of the literature with as many wrong ones, .45 in MIT, whose odometry is off by 84 m; .72, with .01 of the runs
+bent, where it turns wrongly by 6° a step.
 """
 
 
