@@ -45,8 +45,8 @@ def diagnose(graph: ViewGraph, options: DiagnosisOptions = DEFAULTS) -> Diagnosi
     """Every edge judged by the cycles it lies in and by the scene that most edges agree on; see `Diagnosis`.
 
     No edge is trusted for its source unless the options say so, or the graph shows that its consecutive edges are a
-    backbone; then see `find_backbone`. Deterministic. Raises `GraphError` for numbers that are not finite
-    and edges that name no vertex.
+    backbone; then see `find_backbone`. Deterministic. Raises `GraphError` for numbers that are not finite and edges
+    that name no vertex.
     """
     check_graph(graph)
     found = backbone_or_diagnosis(graph, options)

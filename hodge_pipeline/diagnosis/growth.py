@@ -1,8 +1,9 @@
 """Align a scene from its edges: pieces are merged greedily, those with the largest log-evidence first.
 
-Each round every piece picks the neighbour with the largest log-evidence, and two that pick each other are merged. Edges
-between two pieces are votes on their relative pose. Once two pieces are merged, all edges of both vote together, so
-that long cycles are tested without being listed. No edge is trusted: one that agrees with no other is left out.
+Each round every piece picks the neighbour with the largest log-evidence and is merged with it (Borůvka's spanning
+tree). Edges between two pieces are votes on their relative pose. Once two pieces are merged, all edges of both vote
+together, so that long cycles are tested without being listed. No edge is trusted: one that agrees with no other is left
+out.
 """
 
 from __future__ import annotations
@@ -35,23 +36,26 @@ class Alignment:
     poses: Floats
 
 
-def align(evidence: Evidence, start: Alignment | None = None, among: Bools | bool = True) -> Alignment:
-    """The alignment by greedy merging, of single vertices or of the pieces of a start, by the edges `among (E,)`."""
+def align(evidence: Evidence, start: Alignment | None = None) -> Alignment:
+    """The alignment by greedy merging, of single vertices or of the pieces of a start."""
     count, weight = evidence.graph.vertex_count, evidence.weight
     piece, poses = np.arange(count), np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
     if start is not None:
         piece, poses = start.piece.copy(), start.poses.copy()
-    while (votes := collect_votes(evidence, piece, poses, among)) is not None:
-        joined = _joins(votes, _gains(evidence, votes), count)
+    while (votes := collect_votes(evidence, piece, poses)) is not None:
+        joined, moves_low = _joins(votes, _gains(evidence, votes), count)
         if not len(joined):
             break
-        motions, pair = agreed_motions(votes, joined, weight), votes.pair[joined]
+        motions = agreed_motions(votes, joined, weight)
+        motions[moves_low] = se3.inverse(motions[moves_low])
+        pair = votes.pair[joined]
+        low, high = votes.low[pair], votes.high[pair]
         into = np.full(count, -1, np.int64)
-        into[votes.high[pair]] = np.arange(len(pair))
+        into[np.where(moves_low, low, high)] = np.arange(len(pair))
         moving = np.flatnonzero(into[piece] >= 0)
         step = into[piece[moving]]
         poses[moving] = motions[step] @ poses[moving]
-        piece[moving] = votes.low[pair[step]]
+        piece[moving] = np.where(moves_low, high, low)[step]
     return Alignment(piece, poses)
 
 
@@ -66,15 +70,28 @@ def _gains(evidence: Evidence, votes: Votes) -> Floats:
     return np.asarray(gain + PER_FOLD * np.log1p(np.bincount(votes.hypothesis, counted, size)))
 
 
-def _joins(votes: Votes, gain: Floats, count: int) -> Ints:
-    """The hypotheses (rows) to merge pieces by: of pairs of pieces which gain most with each other."""
-    best = np.lexsort((-gain, votes.pair))[votes.start]
-    order = np.argsort(-gain[best], kind="stable")
-    order = order[gain[best][order] > 0]
-    ends, rank = np.stack([votes.low, votes.high], axis=1)[order], np.arange(len(order))[:, None]
-    first = np.full(count, len(order))
-    np.minimum.at(first, ends, rank)
-    return np.asarray(best[order[(first[ends] == rank).all(axis=1)]])
+def _joins(votes: Votes, gain: Floats, count: int) -> tuple[Ints, Bools]:
+    """The hypotheses (rows) to merge pieces by, and whether the piece of lower number moves.
+
+    A piece moves to the one with the largest log-evidence, if that one stays where it is in this round.
+    """
+    order = np.lexsort((-gain, votes.pair))
+    best = order[votes.start]
+    real = np.flatnonzero(gain[best] > 0)
+    real = real[np.lexsort((real, -gain[best][real]))]
+    low, high = votes.low[real], votes.high[real]
+    first = np.full(count, len(real))
+    np.minimum.at(first, low, np.arange(len(real)))
+    np.minimum.at(first, high, np.arange(len(real)))
+    chosen, moves_low = [], []
+    has_moved, base = np.zeros(count, bool), np.zeros(count, bool)
+    for row in np.unique(first[first < len(real)]).tolist():
+        for mover, other, lower in ((high[row], low[row], False), (low[row], high[row], True)):
+            if first[mover] == row and not (has_moved[mover] or base[mover] or has_moved[other]):
+                has_moved[mover] = base[other] = True
+                chosen.append(real[row])
+                moves_low.append(lower)
+    return best[np.array(chosen, np.int64)], np.array(moves_low, bool)
 
 
 @dataclass(frozen=True)
@@ -99,9 +116,9 @@ class Votes:
     agreement: Floats
 
 
-def collect_votes(evidence: Evidence, piece: Ints, piece_from: Floats, among: Bools | bool) -> Votes | None:
-    """The votes of these edges between two pieces; None where there is none."""
-    edge = np.flatnonzero(among & np.not_equal(*piece[evidence.graph.edges.T]))
+def collect_votes(evidence: Evidence, piece: Ints, piece_from: Floats) -> Votes | None:
+    """The votes of all edges between two pieces; None where there is none."""
+    edge = np.flatnonzero(piece[evidence.graph.edges[:, 0]] != piece[evidence.graph.edges[:, 1]])
     if not len(edge):
         return None
     tail, head = evidence.graph.edges[edge].T

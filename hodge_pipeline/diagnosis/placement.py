@@ -1,7 +1,7 @@
 """Log-evidence for the relative placement of two sets of views: a function of sums over the pairs that a cut separates.
 
-The log-evidence of each camera's upright orientation is added. That of a whole arrangement is the sum over its views,
-each against all others.
+The log-evidence of a whole arrangement is the sum over its views, each against all others. That of each camera's
+upright orientation is added to either.
 
 Edges that agree on one placement are one event, since places that look alike give many wrong edges that agree: they
 count by the logarithm of their number. Where every pair was tried, a scene model adds evidence: pairs of views that
