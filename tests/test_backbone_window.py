@@ -132,6 +132,34 @@ def test_a_break_under_all_of_the_window_is_found_by_the_loops() -> None:
     assert set(found.verdict[over]) == {"wrong"} and made.error_m(found.world_from_cam) < 1.0
 
 
+@pytest.mark.parametrize(
+    ("ends", "is_hole"),
+    [
+        ([(149, 152), (147, 152), (148, 153), (145, 153), (146, 155), (144, 153), (143, 155)], True),
+        ([(150, 152), (149, 151), (149, 152), (148, 152), (147, 153), (146, 154), (145, 153)], False),
+    ],
+)
+def test_a_mistaken_place_in_a_gap_of_the_window_does_not_break_a_step(ends: list[Ints], is_hole: bool) -> None:
+    """Seven edges that agree with each other outvoted the only right one: few of them are as short as a window's, or
+    two loops to another place close a cycle across the step.
+    """
+    made, _ = with_window(drive(wrong=0.0, loops=80), 3)
+    graph, at = made.graph, 150
+    low, high = np.sort(graph.edges, axis=1).T
+    over = (low <= at) & (high > at) & (high - low > 1) & (high - low <= 3)
+    right = graph.select(np.flatnonzero(~over))
+    others = np.array([(150, 30), (151, 31), (149, 31), (152, 32)][: 0 if is_hole else 4], np.int64).reshape(-1, 2)
+    mistaken = made.truth[at] @ se3.exp(np.array([0, 0, 0.4, 2.0, -1.5, 0])) @ se3.inverse(made.truth[at])
+    pairs = np.concatenate([others, np.array(ends)])
+    beyond = made.truth[pairs[:, 1]].copy()
+    beyond[len(others) :] = mistaken @ beyond[len(others) :]
+    motions = se3.inverse(made.truth[pairs[:, 0]]) @ beyond
+    information = np.tile(right.information[0], (len(pairs), 1, 1))
+    more = ViewGraph.from_edges(graph.vertex_ids, pairs, motions, information, "loop", dimension=graph.dimension)
+    found = diagnose(ViewGraph.joined([right, more]))
+    assert not found.kept[-len(ends) :].any() and found.kept[: -len(ends)].all()
+
+
 def test_many_steps_are_known_as_all_edges_over_them_tell() -> None:
     """Edges over g steps as exact as those make a step g times as certain: 1 + 2 + 3 times in all."""
     made = drive(wrong=0.0, loops=10)

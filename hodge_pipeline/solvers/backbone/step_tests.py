@@ -43,9 +43,7 @@ class StepCounts(NamedTuple):
 def left_out_steps(graph: ViewGraph, kept: Bools) -> StepCounts:
     """How many of the consecutive edges are not `kept (E,)`, and how many of these no near loop contradicts.
 
-    A step that was measured wrong is contradicted by a kept loop over few steps; or by a pair of kept loops whose lower
-    ends lie on either side of it, few steps apart, and whose upper ends are as near with no step left out between them,
-    or the other way round.
+    A step that was measured wrong is contradicted by a kept loop over few steps, or by a pair of kept loops across it.
     """
     chain = make_chain(graph, sequential_edges(graph))
     inner = chain.step_edge >= 0
@@ -53,12 +51,21 @@ def left_out_steps(graph: ViewGraph, kept: Bools) -> StepCounts:
     near = [ends[np.diff(ends, axis=1)[:, 0] <= LONGEST_CYCLE]]
     left_out = ~np.append(kept, True)[chain.step_edge]
     if len(ends):
-        two = np.sort(ends[cKDTree(ends).query_pairs(LONGEST_CYCLE, p=np.inf, output_type="ndarray")], axis=1)
-        low, high = np.diff(np.cumsum(left_out | ~inner)[two], axis=1)[:, 0].T
-        near += [two[(low == 1) & (high == 0), :, 0], two[(low == 0) & (high == 1), :, 1]]
+        near.append(pairs_across(ends, left_out | ~inner)[1])
     out = inner & left_out
     uncontradicted = out & (chain.over(np.concatenate(near)) == 0)
     return StepCounts(int(uncontradicted.sum()), int(out.sum()))
+
+
+def pairs_across(ends: Ints, steps: Bools) -> tuple[Ints, Ints]:
+    """Pairs (K, 2) of loops with these ends (M, 2), few steps apart, whose lower ends lie on either side of one of the
+    steps (n,) and whose upper ends have none between them, or the other way round; and the spans (K, 2) of the former.
+    """
+    pairs = cKDTree(ends).query_pairs(LONGEST_CYCLE, p=np.inf, output_type="ndarray")
+    two = np.sort(ends[pairs], axis=1)
+    across = np.diff(np.cumsum(steps)[two], axis=1)[:, 0]
+    one = across.sum(axis=1) == 1
+    return pairs[one], np.take_along_axis(two[one], across[one].argmax(axis=1)[:, None, None], axis=2)[..., 0]
 
 
 def agreeing_loops(chain: Chain, among: Bools) -> int:

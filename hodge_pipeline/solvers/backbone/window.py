@@ -21,7 +21,15 @@ from hodge_pipeline.solvers.backbone.judge import by_path
 from hodge_pipeline.solvers.backbone.linear import inverse, linearise
 from hodge_pipeline.solvers.backbone.parallel import Fused
 from hodge_pipeline.solvers.backbone.sequence import sequential_edges, steps_apart
-from hodge_pipeline.solvers.backbone.step_tests import AS_STATED, LONGEST_CYCLE, LOOPS_AT_A_STEP, TESTED, closes, gate
+from hodge_pipeline.solvers.backbone.step_tests import (
+    AS_STATED,
+    LONGEST_CYCLE,
+    LOOPS_AT_A_STEP,
+    TESTED,
+    closes,
+    gate,
+    pairs_across,
+)
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.reweighted import SETTLED
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
@@ -56,9 +64,9 @@ def windowed(given: Fused) -> Fused:
     if unknown and 2 * closing.sum() < len(near):  # errors that are learned from wrong edges would explain all
         return given
     learned = _with_learned_covariance(chain, near) if unknown else chain
-    fits, scale, untested = _fitting(learned, near, closing)
+    fits, scale, untested, doubted = _fitting(learned, near, closing)
     near, fits = near[~untested], fits[~untested]
-    weights, poses = _agreeing(learned, near, fits, scale)
+    weights, poses = _agreeing(learned, near, fits, scale, doubted)
     (of_step, of_near), agree = np.split(weights, [len(at)]), weights[len(at) :] > 0
     good = near[agree]
     if len(good) < AGREEING * len(near) or not _many(chain, good):
@@ -124,11 +132,12 @@ def _closing(chain: Chain, near: Ints) -> Bools:
     return closes(chain.motion[near], ahead, gate(chain), np.sqrt(high - low))
 
 
-def _fitting(chain: Chain, near: Ints, closing: Bools) -> tuple[Bools, float, Bools]:
+def _fitting(chain: Chain, near: Ints, closing: Bools) -> tuple[Bools, float, Bools, Bools]:
     """Which of the `near` loops (K,) agree with the chain; the factor on χ² by which loops err more than stated, from
-    those `closing (K,)`; and which of the others (K,) are left to the judging of loops: they pass over a step that no
-    loop confirms and none of a short cycle tests. Wrong loops of one place agree with each other, and nothing of a
-    window says otherwise there.
+    those `closing (K,)`; which of the others (K,) are left to the judging of loops; and the doubted steps (n,).
+
+    Left to it are loops over a doubted step where fewer than half as many of them are short as elsewhere: wrong ones of
+    one place agree with each other, and nothing of a window says otherwise there.
     """
     linear, ends, size = linearise(chain, chain.poses), chain.ends[near], len(chain.axes)
     chi2 = mahalanobis(linear.loops[0][near], by_path(linear, near))[0]
@@ -136,27 +145,47 @@ def _fitting(chain: Chain, near: Ints, closing: Bools) -> tuple[Bools, float, Bo
     usual_scale = float(np.median(usual)) / MEDIAN_CHI2[size] if len(usual) else 1.0
     scale = max(usual_scale, _rounding(chain, near))
     fits = chi2 <= STUDENT_99[size] * scale
-    short = ends[np.diff(ends, axis=1)[:, 0] <= LONGEST_CYCLE]
-    untested = (chain.over(ends[fits]) == 0) & (chain.over(short) == 0)
-    return fits, scale, ~fits & _pass_over(chain, ends, untested)
+    short, over = (chain.over(each) for each in (ends[np.diff(ends, axis=1)[:, 0] <= LONGEST_CYCLE], ends))
+    doubted = _doubted(chain, near, fits, closing)
+    untested = doubted & (2 * short * over.sum() < over * short.sum())
+    return fits, scale, ~fits & _pass_over(chain, ends, untested), doubted
+
+
+def _doubted(chain: Chain, near: Ints, fits: Bools, closing: Bools) -> Bools:
+    """Steps (n,) that none of the `near` loops (K,) which fit confirms; nor do, where all near loops over them are far
+    off, two others that close a cycle across them.
+    """
+    ends, poses = chain.ends, chain.poses
+    doubted = chain.over(ends[near[fits]]) == 0
+    far_off = doubted & (chain.over(ends[near]) > 0) & (chain.over(ends[near[closing]]) == 0)
+    around = np.stack([np.maximum(ends - LONGEST_CYCLE, 0), np.minimum(ends + LONGEST_CYCLE, chain.size - 1)], axis=2)
+    others = np.setdiff1d(np.flatnonzero(_pass_over(chain, around, far_off).any(axis=1)), near)
+    if not len(others):
+        return np.asarray(doubted)
+    pairs, spans = pairs_across(ends[others], far_off | ~chain.inner)
+    one, other = others[pairs].T
+    (low, high), (low_other, high_other) = ends[one].T, ends[other].T
+    before, after = se3.inverse(poses[low]) @ poses[low_other], se3.inverse(poses[high_other]) @ poses[high]
+    passed = np.abs(ends[one] - ends[other]).sum(axis=1)
+    confirms = closes(chain.motion[one], before @ chain.motion[other] @ after, gate(chain), np.sqrt(passed))
+    return np.asarray(doubted & (chain.over(spans[confirms]) == 0))
 
 
 def _pass_over(chain: Chain, ends: Ints, steps: Bools) -> Bools:
-    """Which of the spans (K, 2) of positions pass over one of these steps (n,)."""
+    """Which of the spans (..., 2) of positions pass over one of these steps (n,)."""
     count = np.append(0, np.cumsum(steps & chain.inner))
-    return np.asarray(count[ends[:, 1] + 1] > count[ends[:, 0] + 1])
+    return np.asarray(count[ends[..., 1] + 1] > count[ends[..., 0] + 1])
 
 
-def _agreeing(chain: Chain, near: Ints, fits: Bools, scale: float) -> tuple[Floats, Floats]:
+def _agreeing(chain: Chain, near: Ints, fits: Bools, scale: float, doubted: Bools) -> tuple[Floats, Floats]:
     """Weights (N,) of all steps and then of the `near` loops, 0 for those that disagree; and the poses (n, 4, 4) of a
-    solve with Student's t; `fits` and `scale`: see `_fitting`.
+    solve with Student's t; `fits`, `scale` and `doubted`: see `_fitting`.
 
     It starts without loops that disagree with the chain over steps which other loops confirm, and without steps that
     two loops or more contradict and none confirms. An edge that errs no more than it states, and closes as right cycles
     do, agrees however exact the others are.
     """
     ends, size = chain.ends[near], len(chain.axes)
-    doubted = chain.over(ends[fits]) == 0
     fits = fits | _pass_over(chain, ends, doubted)
     at = np.flatnonzero(chain.step_edge >= 0)
     step = np.where(doubted & (chain.over(ends) > 1), 0.0, 1.0)[at]
