@@ -18,6 +18,7 @@ from hodge_pipeline.solvers.backbone.judge import Judged, densities, judge
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.mistakes import Mistake, mistakes
+from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.places import CHANCES, MISTAKEN, Places
 from hodge_pipeline.solvers.backbone.polish import polished
 from hodge_pipeline.solvers.backbone.scales import Scales, decoys, learned_scales
@@ -165,9 +166,13 @@ class _Rated:
     shares (2,) of right and wrong ones; and the chain there.
     """
 
-    score: Floats
+    judged: Judged
     shares: Floats
     linear: Linear
+
+    @property
+    def score(self) -> Floats:
+        return np.minimum(self.judged.factor, self.judged.log_odds)
 
 
 @dataclass(frozen=True)
@@ -283,14 +288,34 @@ class _Trial:
         among the strongest may be followed, which the others would outvote.
         """
         limit = 0.5 * np.log(max(len(self.trusted), 1))
-        rated = self.rated(used, linear, shares)
+        rated, together = self.rated(used, linear, shares), np.zeros_like(used)
         for number in range(MOST_GROWN):
             before, kept = used, (used & (rated.score > 0)) | self.trusted
             used = kept | chosen(rated.score, (rated.score > limit) & ~kept)
             if number and used.sum() <= before.sum():
-                break
+                together = self.likely_together(rated, ~used & ~together)
+                if not together.any():
+                    break
+                used = used | together
             rated = self.rated(used, rated.linear, rated.shares)
         return used, rated
+
+    def likely_together(self, rated: _Rated, among: Bools) -> Bools:
+        """Of the loops `among (M,)`, each of which the path may lead to but does not make likely, those that agree
+        with one of them, where these are more places than agree by chance.
+        """
+        rows = np.flatnonzero(among & (rated.judged.chi2 <= STUDENT_99[len(self.start.chain.axes)]))
+        found = np.zeros_like(among)
+        if len(rows) < 2:
+            return found
+        pairwise = PairwiseConsistency(rated.linear, rated.judged.factor, rated.judged.log_wrong, ~among)
+        least = BY_CHANCE + float(np.log(len(among)))
+        for seed, factor in pairwise.seeds(rows):
+            gain = float(pairwise.gains(seed, rows, factor).sum())
+            if gain > least:
+                found[rows[factor > 0]] = found[seed] = True
+                return found
+        return found
 
     def rated(self, used: Bools, linear: Linear, shares: Floats) -> _Rated:
         """All loops at the poses of one used loop (M,) of each place, optimised from `linear`."""
@@ -299,7 +324,7 @@ class _Trial:
         fit = optimised(Fit(self.reduced(rows), linear), MOST_STEPS)
         judged = judge(fit.linear, fit, shares, self.outliers)
         shares, _ = mixture(judged.factor)
-        return _Rated(np.minimum(judged.factor, judged.log_odds), shares, fit.linear)
+        return _Rated(judged, shares, fit.linear)
 
     def reduced(self, rows: Ints) -> Reduced:
         """The graph of these loops, of all where it may not be thinned."""
