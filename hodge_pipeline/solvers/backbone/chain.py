@@ -21,8 +21,9 @@ PLACE = 4.0
 STEPS_OF_PLACE, FEWEST_PLACES = 20, 50
 """Fewest steps of a place, however large their errors; fewest places of a chain, however small these are."""
 SMALLEST_SIGMA = 0.03
-"""Share of the median standard deviation that is added to each, in squares. Beside one of a thousandth the normal
-equations lose the other edges to rounding; from .01 to .1 the manhattan graph is judged alike.
+"""Share of the largest median standard deviation of rotation, and of translation, that is added to each axis of it, in
+squares. Axes turn with poses, which are known to hundredths of a radian: an error of a thousandth of the others is that
+of no axis. From .01 to .1 the manhattan graph is judged alike.
 """
 
 
@@ -201,8 +202,9 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
     ends = place[graph.edges[rows]]
     motion, loop_covariance = _directed(graph.i_from_j[rows], covariance[rows], ends[:, 0] > ends[:, 1], axes, unit)
     usual = np.median(np.einsum("eii->ei", np.concatenate([step_covariance[at], loop_covariance])), axis=0)
-    step_covariance[at] += np.diag(SMALLEST_SIGMA**2 * usual)
-    loop_covariance += np.diag(SMALLEST_SIGMA**2 * usual)
+    least = SMALLEST_SIGMA**2 * np.diag(np.where(axes < 3, usual[axes < 3].max(), usual[axes >= 3].max()))
+    step_covariance[at] += least
+    loop_covariance += least
     return Chain(
         order,
         path,
