@@ -18,9 +18,9 @@ from hodge_pipeline.solvers.backbone.judge import Judged, densities, judge
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.mistakes import Mistake, mistakes
-from hodge_pipeline.solvers.backbone.places import CHANCES, MISTAKEN, Places
+from hodge_pipeline.solvers.backbone.places import MISTAKEN, Places, factors_by_chance
 from hodge_pipeline.solvers.backbone.polish import polished
-from hodge_pipeline.solvers.backbone.scales import Scales, decoys, learned_scales
+from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
 from hodge_pipeline.types import Bools, Floats, Ints
 
 ROUNDS = 6
@@ -139,13 +139,11 @@ class LoopJudge:
         """Whether loops bend the path, and agree with the poses between any other places too: a path that wrong ones
         have folded, or bent from one mistaken place to the next, is small, and its places are near each other.
         """
-        fit, chain = Fit(found.reduced, found.linear), found.linear.chain
+        fit = Fit(found.reduced, found.linear)
         chi2 = mahalanobis(*fit.left_out(fit.reduced.of_runs))[0]
-        if (chi2 > STUDENT_99[len(chain.axes)]).sum() <= BENT * len(chi2):
+        if (chi2 > STUDENT_99[len(found.linear.chain.axes)]).sum() <= BENT * len(chi2):
             return False
-        loop, ends = decoys(chain, -(-CHANCES // len(chain.ends)))
-        anywhere = judge(replace(found.linear, chain=chain.with_loops(loop, ends)), None, EVEN, self.outliers)
-        return bool((anywhere.factor > 0).mean() > ANYWHERE)
+        return bool((factors_by_chance(found.linear, self.outliers) > 0).mean() > ANYWHERE)
 
     def _others_agree(self, found: Inferred, chain: Chain) -> bool:
         """Whether by other errors, those of `chain`, other loops than the used ones agree with the poses found."""

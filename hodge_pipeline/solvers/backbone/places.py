@@ -7,7 +7,7 @@ solution, whose χ² counts how far the steps bend.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,7 +16,7 @@ from scipy.special import gammaln, pdtrc
 from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel, log_student, student_log_density
 from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, by_path, judge
-from hodge_pipeline.solvers.backbone.linear import Linear, linearise
+from hodge_pipeline.solvers.backbone.linear import Linear
 from hodge_pipeline.solvers.backbone.loop_places import corridors, loops_at_place, one_of_each_place
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.scales import decoys
@@ -118,9 +118,7 @@ class Places:
         """
         if self.size[right].max() > PAIRED:
             return -np.inf
-        chain = self.start.chain
-        loop, ends = decoys(chain, -(-CHANCES // len(chain.ends)))
-        others = judge(linearise(chain.with_loops(loop, ends), self.start.poses), None, EVEN, self.outliers).factor
+        others = factors_by_chance(self.start, self.outliers)
         strongest = np.flatnonzero(right)[np.argsort(-self.bare[right], kind="stable")]
         stronger = len(others) - np.searchsorted(np.sort(others), self.bare[strongest]) + 0.5
         sizes = np.sort(np.concatenate([self.size, self.unused]))
@@ -174,6 +172,13 @@ class Places:
         bent = np.argsort(-chi2, kind="stable")
         doubtful = active[bent[(log_odds + np.log(MISTAKEN_PLACES))[bent] < 0][:MOST_TRIED]]
         return [found.right & (np.arange(len(self.loop)) != place) for place in doubtful]
+
+
+def factors_by_chance(linear: Linear, outliers: OutlierModel) -> Floats:
+    """Log Bayes factors (K,) that the motions of loops have between random places of a chain, along its path."""
+    chain = linear.chain
+    loop, ends = decoys(chain, -(-CHANCES // len(chain.ends)))
+    return judge(replace(linear, chain=chain.with_loops(loop, ends)), None, EVEN, outliers).factor
 
 
 def agreeing_groups(pairwise: PairwiseConsistency, rows: Ints) -> list[Ints]:
