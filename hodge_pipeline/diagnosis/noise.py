@@ -11,6 +11,7 @@ from scipy.special import chdtri
 from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import MEDIAN_CHI2, has_unit_information, mean_variances
 from hodge_pipeline.complex.cycles import Loops
+from hodge_pipeline.solvers.backbone.levels import SIGMAS
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 DEFAULT_ANGLE_RAD, DEFAULT_SHARE = 0.03, 0.05
@@ -26,8 +27,6 @@ FEWEST_CYCLES, SOME_CYCLES = 20, 4
 """Fewest closing cycles to estimate errors from, and fewest cycles to bound them where fewer close."""
 COPIES = 1e-5
 """Share of the gate below which cycles join copies of one measurement and are no evidence."""
-STATED = 3.0
-"""Closing error, in standard deviations by the stated information, up to which this explains a cycle."""
 NEARLY_ALL = 0.95
 """Share of closing cycles: if the stated information explains so many, errors are scaled to cover as many."""
 MAXWELL_MEDIAN, MAXWELL_NEARLY_ALL = math.sqrt(MEDIAN_CHI2[3]), math.sqrt(chdtri(3, 1 - NEARLY_ALL))
@@ -97,7 +96,7 @@ def edge_noise(
     turn = turned.scale(FIRST_GATE_RAD, prior, credible[0] if informed else usual[0])
     shift = shifted.scale(FIRST_GATE_SHARE * reach_m, prior, credible[1] if informed else usual[1])
     closes = (turned.error < FIRST_GATE_RAD) & (shifted.error < FIRST_GATE_SHARE * reach_m)
-    sound = (turned.ratio < STATED) & (shifted.ratio < STATED)
+    sound = (turned.ratio < SIGMAS) & (shifted.ratio < SIGMAS)
     if informed and closes.sum() >= FEWEST_CYCLES and sound[closes].mean() >= NEARLY_ALL:
         turn = max(turn, turned.covering_scale(sound, closes))
         shift = max(shift, shifted.covering_scale(sound, closes))

@@ -10,6 +10,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import FREEDOM, STUDENT_99, tail_weight
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis, student_log_density
 from hodge_pipeline.solvers.backbone.fit import Fit
+from hodge_pipeline.solvers.backbone.levels import MOST_TRIED
 from hodge_pipeline.solvers.backbone.linear import linearise, turned
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.step_model import StepModel
@@ -17,8 +18,6 @@ from hodge_pipeline.types import Bools, Floats, Ints
 
 PLATEAU = 12.0
 """Nats below the best step at which a step is no candidate for the break."""
-MOST_UNUSUAL = 3
-"""Steps that are tried by their own size alone: a limit on cost."""
 LEAST_COST = 4.0
 """Nats that the residual of a run must cost before its steps are tested: a limit on time."""
 
@@ -104,7 +103,7 @@ def _shifted_aside(pairwise: PairwiseConsistency, usual: StepModel, loop: int, a
 def unusual_breaks(usual: StepModel) -> list[Break]:
     """Breaks at the most unusual steps, the most unusual first, whatever the loops say; `log_evidence` is `unusual`."""
     rows = np.argsort(-usual.unusual)
-    return [Break(int(at), usual.centre, usual.covariance, float(usual.unusual[at])) for at in rows[:MOST_UNUSUAL]]
+    return [Break(int(at), usual.centre, usual.covariance, float(usual.unusual[at])) for at in rows[:MOST_TRIED]]
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mi
 from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, optimised
 from hodge_pipeline.solvers.backbone.inference import Inferred, LoopJudge, by_chance
 from hodge_pipeline.solvers.backbone.judge import densities
+from hodge_pipeline.solvers.backbone.levels import MOST_TRIED
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
 from hodge_pipeline.solvers.backbone.mistakes import shared_shift, without_shift
@@ -40,8 +41,6 @@ SMALLER, OF_A_SHIFT = (1 / 4, 1 / 16), 3 * BY_CHANCE
 """Factors on the learned errors by which mistaken loops are found; with the smaller alone 286 wrong ones of `alike` are
 kept for 38. And the nats that a shift which they share must gain, more than chance for each of its axes.
 """
-DRAWN = 3
-"""Times that the motions of loops are drawn at random."""
 
 
 def infer_bridged(
@@ -159,7 +158,7 @@ def _random_motions_do_as_well(chain: Chain, found: Inferred, by: LoopJudge) -> 
     rng, twists = np.random.default_rng(4), chain.log(chain.motion)
     middle = np.median(twists, axis=0)
     spread = np.median(np.abs(twists - middle), axis=0) / np.sqrt(MEDIAN_CHI2[1])
-    for _ in range(DRAWN):
+    for _ in range(MOST_TRIED):
         drawn = chain.exp(middle + spread * rng.standard_normal(twists.shape))
         motion = np.where(by.trusted[:, None, None], chain.motion, drawn)
         other = by.infer(replace(chain, motion=motion), found.scales)

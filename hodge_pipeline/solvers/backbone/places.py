@@ -16,6 +16,7 @@ from scipy.special import gammaln, pdtrc
 from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel, log_student, student_log_density
 from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, by_path, judge
+from hodge_pipeline.solvers.backbone.levels import MOST_TRIED, RANDOM
 from hodge_pipeline.solvers.backbone.linear import Linear
 from hodge_pipeline.solvers.backbone.loop_places import corridors, loops_at_place, one_of_each_place
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
@@ -28,8 +29,6 @@ MISTAKEN_PLACES = 0.2
 """Expected number of mistaken places to a right one, beside the rivals that are not used. With more, a path that closes
 once would stay open: its loops can show little more than that the drift is as stated.
 """
-MOST_TRIED = 3
-"""Places left out on trial each time: a limit on cost."""
 MISTAKEN = float(np.log(20.0))
 """Log-odds of right places against mistaken ones that are enough, and that a change must gain."""
 FEW_ALIKE = 0.1
@@ -39,8 +38,6 @@ corridors: counted too, a few random loops kept 9 of 180 short rings at their od
 """
 PAIRED = 2
 """Loops of one place that agree by chance at the most: three among thousands are rare."""
-CHANCES = 4000
-"""Fewest random loops for the distribution of Bayes factors by chance."""
 MOST_PAIRS = 200_000
 """Pairs of loops that are compared: a limit on memory and time. All of 6000 at a few places took 2 GB and 22 CPU s."""
 
@@ -177,7 +174,7 @@ class Places:
 def factors_by_chance(linear: Linear, outliers: OutlierModel) -> Floats:
     """Log Bayes factors (K,) that the motions of loops have between random places of a chain, along its path."""
     chain = linear.chain
-    loop, ends = decoys(chain, -(-CHANCES // len(chain.ends)))
+    loop, ends = decoys(chain, -(-RANDOM // len(chain.ends)))
     return judge(replace(linear, chain=chain.with_loops(loop, ends)), None, EVEN, outliers).factor
 
 

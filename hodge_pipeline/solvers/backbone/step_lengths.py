@@ -12,6 +12,7 @@ import numpy as np
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE
 from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, optimised, thinned
+from hodge_pipeline.solvers.backbone.levels import SIGMAS
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -22,10 +23,6 @@ TOLD = 0.1
 """Largest standard deviation of the logarithm of a factor that is named. Loops of almost one place, as all of
 Bicocca's, make a path the likelier the shorter it is: its factor is 1.5 to 2.3, to .19 to .5, those of ten others of
 the literature to .004 to .1, of 100 simulated ones to .09 but for a few.
-"""
-AGREE = 3.0
-"""Standard deviations by which all loops together may tell another factor. Where loops or their errors are mistaken
-they tell one that differs by 3.5 to 6.
 """
 SPREAD = 0.5
 """Prior standard deviation of a factor, for one that loops do not tell."""
@@ -47,7 +44,8 @@ def misstated_lengths(fitted: Chain, poses: Floats, used: Ints) -> list[StepLeng
     (n, 4, 4)`: solved ones.
 
     A factor has to make the residuals of one loop of each place smaller than chance does, by whatever errors: those
-    that were learned with a wrong length explain it. All loops together have to tell the same factor.
+    that were learned with a wrong length explain it. All loops together have to tell the same factor, within
+    `SIGMAS` of its standard deviations: where loops or their errors are mistaken they tell one that is 3.5 to 6 off.
     """
     measured = fitted.inner & ~fitted.bridged
     path = np.cumsum(fitted.step_edge < 0) - 1
@@ -69,7 +67,7 @@ def misstated_lengths(fitted: Chain, poses: Floats, used: Ints) -> list[StepLeng
         if sigma > TOLD:
             break
         _, more = _refitted(Fit(thinned(fitted, used), other.linear), best)
-        if abs(np.log(more)) > AGREE * sigma:
+        if abs(np.log(more)) > SIGMAS * sigma:
             break
         found.append(StepLength(best, factor * more, best is measured))
         fit = other
