@@ -249,10 +249,6 @@ share of χ² that a step must then gain.
 """
 
 
-MOST_STEPS = 15
-"""Gauss–Newton steps: a limit on cost."""
-
-
 def optimised(fit: Fit, steps: int) -> Fit:
     """The fit after up to `steps` of Gauss–Newton with halving, until the predicted decrease of χ² is below
     `LEAST_WON`, or below `SHARE_WON` of χ² where loops contradict each other.

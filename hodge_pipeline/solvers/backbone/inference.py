@@ -13,8 +13,9 @@ from hodge_pipeline.complex.chi2 import STUDENT_99
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, EVEN, OutlierModel, mahalanobis, mixture
-from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, Reduced, from_rotations, optimised, thinned
+from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, from_rotations, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, densities, judge
+from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.mistakes import Mistake, mistakes
@@ -268,7 +269,7 @@ class _Trial:
         """All loops judged at the poses of the used ones (M,), of which those that remain likely are used."""
         start, chain, trusted = self.start, self.start.chain, self.by.trusted
         reduced = thinned(chain, np.flatnonzero(used))
-        fit = optimised(Fit(reduced, linear), MOST_STEPS)
+        fit = optimised(Fit(reduced, linear), MOST_ROUNDS)
         judged = judge(fit.linear, fit, shares, self.by.outliers)
         shares, top = mixture(judged.factor)
         used = used & ((judged.log_odds > 0) | trusted)
@@ -294,7 +295,7 @@ class _Trial:
         """
         limit = 0.5 * np.log(max(len(self.by.trusted), 1))
         rated = self.rated(used, linear, shares)
-        for number in range(MOST_GROWN):
+        for number in range(MOST_ROUNDS):
             before, kept = used, (used & (rated.score > 0)) | self.by.trusted
             used = kept | chosen(rated.score, (rated.score > limit) & ~kept)
             if number and used.sum() <= before.sum():
@@ -306,7 +307,7 @@ class _Trial:
         """All loops at the poses of one used loop (M,) of each place, optimised from `linear`."""
         rows, ends = np.flatnonzero(used), self.start.chain.places
         rows = rows[one_of_each_place(ends[rows])] if len(rows) else rows
-        fit = optimised(Fit(self.reduced(rows), linear), MOST_STEPS)
+        fit = optimised(Fit(self.reduced(rows), linear), MOST_ROUNDS)
         judged = judge(fit.linear, fit, shares, self.by.outliers)
         shares, _ = mixture(judged.factor)
         return _Rated(np.minimum(judged.factor, judged.log_odds), shares, fit.linear)
@@ -326,10 +327,10 @@ class _Trial:
         best, top, seen = (self.alone, start), -np.inf, b""
         for number in range(ROUNDS):
             reduced = self.reduced(np.flatnonzero(used))
-            fit = optimised(Fit(reduced, linear), MOST_STEPS)
+            fit = optimised(Fit(reduced, linear), MOST_ROUNDS)
             if not number and fit.cost > len(reduced.active) * len(chain.axes):
                 # more than right loops should leave: the descent may have ended in a local minimum
-                other = optimised(Fit(reduced, from_rotations(Fit(reduced, start), MOST_STEPS)), MOST_STEPS)
+                other = optimised(Fit(reduced, from_rotations(Fit(reduced, start), MOST_ROUNDS)), MOST_ROUNDS)
                 fit = min(fit, other, key=lambda each: each.cost)
             linear = fit.linear
             judged = judge(linear, fit, shares, self.by.outliers)
@@ -357,10 +358,6 @@ def _single_joins(chain: Chain, used: Bools) -> Bools:
     rows = np.flatnonzero(used & np.not_equal(*path[chain.ends].T))
     lone[rows] = series_classes(path[chain.ends[rows]], int(path[-1]) + 1) < 0
     return lone
-
-
-MOST_GROWN = 30
-"""Rounds in which loops are added: a limit on cost."""
 
 
 BY_CHANCE_EACH_FOLD = 3.0

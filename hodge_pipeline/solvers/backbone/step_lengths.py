@@ -11,8 +11,8 @@ import numpy as np
 
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE
-from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, optimised, thinned
-from hodge_pipeline.solvers.backbone.levels import SIGMAS
+from hodge_pipeline.solvers.backbone.fit import Fit, optimised, thinned
+from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS, SIGMAS
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -26,8 +26,8 @@ the literature to .004 to .1, of 100 simulated ones to .09 but for a few.
 """
 SPREAD = 0.5
 """Prior standard deviation of a factor, for one that loops do not tell."""
-ROUNDS, SETTLED = 5, 1e-3
-"""Refits of a factor: a limit on cost; and the change of its logarithm that ends them."""
+SETTLED = 1e-3
+"""Change of the logarithm of a factor that ends its refits."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def misstated_lengths(fitted: Chain, poses: Floats, used: Ints) -> list[StepLeng
     places = thinned(fitted, used[one_of_each_place(fitted.places[used])])
     freedom = len(fitted.axes) * (len(places.active) - len(np.unique(path[fitted.ends[places.active]])) + 1)
     found: list[StepLength] = []
-    fit = optimised(Fit(places, linearise(fitted, poses)), MOST_STEPS)
+    fit = optimised(Fit(places, linearise(fitted, poses)), MOST_ROUNDS)
     while freedom > len(groups) and len(found) < len(alone):
         best = max(groups, key=lambda of: _gain(fit, of))
         other, factor = _refitted(fit, best)
@@ -77,14 +77,14 @@ def misstated_lengths(fitted: Chain, poses: Floats, used: Ints) -> list[StepLeng
 def _refitted(fit: Fit, of: Bools) -> tuple[Fit, float]:
     """The fit with the likeliest length of the steps `of (n,)`, and by how many times they were too long."""
     log_length = 0.0
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROUNDS):
         slope, curvature = _score(fit, of)
         change = (slope - log_length / SPREAD**2) / (curvature + 1 / SPREAD**2)
         log_length += (change := float(np.clip(change, -SPREAD, SPREAD)))
         chain, step = fit.linear.chain, fit.linear.chain.step.copy()
         step[of, :3, 3] *= np.exp(change)
         linear = linearise(replace(chain, step=step), fit.linear.poses)
-        fit = optimised(replace(fit, linear=linear), MOST_STEPS)
+        fit = optimised(replace(fit, linear=linear), MOST_ROUNDS)
         if abs(change) < SETTLED:
             break
     return fit, float(np.exp(-log_length))

@@ -18,7 +18,7 @@ from hodge_pipeline.complex.chi2 import (
 from hodge_pipeline.solvers.backbone.chain import STEPS_OF_PLACE, Chain, make_chain
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis
 from hodge_pipeline.solvers.backbone.judge import by_path
-from hodge_pipeline.solvers.backbone.levels import NEARLY_ALL, TOLERANCE
+from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS, NEARLY_ALL, TOLERANCE
 from hodge_pipeline.solvers.backbone.linear import inverse, linearise
 from hodge_pipeline.solvers.backbone.parallel import Fused
 from hodge_pipeline.solvers.backbone.sequence import sequential_edges, steps_apart
@@ -27,8 +27,6 @@ from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.reweighted import SETTLED
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
-ROUNDS = 10
-"""Reweighted solves: a limit on cost."""
 WRITTEN, TURNED_RAD = 5e-6, 10.0
 """Largest rounding error, as a share of the number, where six digits are written, as streams of C++ do; and an angle
 that was not taken back to half a turn.
@@ -176,7 +174,7 @@ def _agreeing(chain: Chain, near: Ints, fits: Bools, scale: float) -> tuple[Floa
         return solve(weighted, start=start, initial="given", relative_tolerance=TOLERANCE).world_from_cam
 
     poses = solved(weights, chain.poses)
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROUNDS):
         chi2 = chi2_by_information(graph, poses) / scale
         before, weights = weights, np.minimum(tail_weight(chi2, size), 1.0)
         if np.abs(weights - before).max() < SETTLED:
