@@ -15,7 +15,7 @@ from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mi
 from hodge_pipeline.solvers.backbone.fit import Fit, optimised
 from hodge_pipeline.solvers.backbone.inference import Inferred, LoopJudge, by_chance
 from hodge_pipeline.solvers.backbone.judge import densities
-from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS, MOST_TRIED
+from hodge_pipeline.solvers.backbone.levels import MOST_TRIED
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
 from hodge_pipeline.solvers.backbone.mistakes import shared_shift, without_shift
@@ -216,7 +216,7 @@ def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
     candidates = [(each, least) for each in agreed[:TRIED_AT_ONCE] if each is agreed[0] or each.at != agreed[0].at]
     if len(found.reduced.runs):
-        runs = Runs.of(optimised(Fit(found.reduced, found.linear), MOST_ROUNDS), linear.poses, usual)
+        runs = Runs.of(optimised(Fit(found.reduced, found.linear)), linear.poses, usual)
         of_run, scores = runs.likeliest_break(), runs.score(np.array([each.at for each in unlike], np.int64))
         unlike = [each for each, score in zip(unlike, scores, strict=True) if score > BY_CHANCE]
         if of_run is not None and of_run.log_evidence > BY_CHANCE:

@@ -269,7 +269,7 @@ class _Trial:
         """All loops judged at the poses of the used ones (M,), of which those that remain likely are used."""
         start, chain, trusted = self.start, self.start.chain, self.by.trusted
         reduced = thinned(chain, np.flatnonzero(used))
-        fit = optimised(Fit(reduced, linear), MOST_ROUNDS)
+        fit = optimised(Fit(reduced, linear))
         judged = judge(fit.linear, fit, shares, self.by.outliers)
         shares, top = mixture(judged.factor)
         used = used & ((judged.log_odds > 0) | trusted)
@@ -307,7 +307,7 @@ class _Trial:
         """All loops at the poses of one used loop (M,) of each place, optimised from `linear`."""
         rows, ends = np.flatnonzero(used), self.start.chain.places
         rows = rows[one_of_each_place(ends[rows])] if len(rows) else rows
-        fit = optimised(Fit(self.reduced(rows), linear), MOST_ROUNDS)
+        fit = optimised(Fit(self.reduced(rows), linear))
         judged = judge(fit.linear, fit, shares, self.by.outliers)
         shares, _ = mixture(judged.factor)
         return _Rated(np.minimum(judged.factor, judged.log_odds), shares, fit.linear)
@@ -327,10 +327,10 @@ class _Trial:
         best, top, seen = (self.alone, start), -np.inf, b""
         for number in range(ROUNDS):
             reduced = self.reduced(np.flatnonzero(used))
-            fit = optimised(Fit(reduced, linear), MOST_ROUNDS)
+            fit = optimised(Fit(reduced, linear))
             if not number and fit.cost > len(reduced.active) * len(chain.axes):
                 # more than right loops should leave: the descent may have ended in a local minimum
-                other = optimised(Fit(reduced, from_rotations(Fit(reduced, start), MOST_ROUNDS)), MOST_ROUNDS)
+                other = optimised(Fit(reduced, from_rotations(Fit(reduced, start))))
                 fit = min(fit, other, key=lambda each: each.cost)
             linear = fit.linear
             judged = judge(linear, fit, shares, self.by.outliers)

@@ -16,7 +16,7 @@ from scipy.special import gammaln, pdtrc
 from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel, log_student, student_log_density
 from hodge_pipeline.solvers.backbone.fit import Fit, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, by_path, judge
-from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS, MOST_TRIED, RANDOM
+from hodge_pipeline.solvers.backbone.levels import MOST_TRIED, RANDOM
 from hodge_pipeline.solvers.backbone.linear import Linear
 from hodge_pipeline.solvers.backbone.loop_places import corridors, loops_at_place, one_of_each_place
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
@@ -125,7 +125,7 @@ class Places:
 
     def arranged(self, right: Bools, linear: Linear) -> Arrangement:
         """The arrangement of these places (K,), optimised from the poses of `linear`."""
-        fit = optimised(Fit(thinned(self.start.chain, self.loop[right]), linear), MOST_ROUNDS)
+        fit = optimised(Fit(thinned(self.start.chain, self.loop[right]), linear))
         active = np.searchsorted(self.loop, fit.reduced.active)
         # without rivals MISTAKEN_PLACES counts once, not for each place
         prior = max(len(active) - 1, 0) * float(np.log(MISTAKEN_PLACES)) - float(self.rivals(right)[active].sum())

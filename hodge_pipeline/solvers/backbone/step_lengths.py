@@ -56,7 +56,7 @@ def misstated_lengths(fitted: Chain, poses: Floats, used: Ints) -> list[StepLeng
     places = thinned(fitted, used[one_of_each_place(fitted.places[used])])
     freedom = len(fitted.axes) * (len(places.active) - len(np.unique(path[fitted.ends[places.active]])) + 1)
     found: list[StepLength] = []
-    fit = optimised(Fit(places, linearise(fitted, poses)), MOST_ROUNDS)
+    fit = optimised(Fit(places, linearise(fitted, poses)))
     while freedom > len(groups) and len(found) < len(alone):
         best = max(groups, key=lambda of: _gain(fit, of))
         other, factor = _refitted(fit, best)
@@ -84,7 +84,7 @@ def _refitted(fit: Fit, of: Bools) -> tuple[Fit, float]:
         chain, step = fit.linear.chain, fit.linear.chain.step.copy()
         step[of, :3, 3] *= np.exp(change)
         linear = linearise(replace(chain, step=step), fit.linear.poses)
-        fit = optimised(replace(fit, linear=linear), MOST_ROUNDS)
+        fit = optimised(replace(fit, linear=linear))
         if abs(change) < SETTLED:
             break
     return fit, float(np.exp(-log_length))
