@@ -9,7 +9,6 @@ import numpy as np
 from hodge_pipeline.complex.chi2 import tail_weight
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, optimised
-from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS
 from hodge_pipeline.solvers.backbone.linear import Linear
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
 from hodge_pipeline.solvers.reweighted import SETTLED
@@ -23,8 +22,10 @@ CROWDED_POWER = 0.5
 """Power of the number of loops at one place by which their variances grow: 0 for independent errors, 1 for the same
 error in all.
 """
-STEPS = 3
-"""Gauss–Newton steps in each reweighting round: a limit on cost."""
+ROUNDS, STEPS = 5, 3
+"""Reweighting rounds, and Gauss–Newton steps in each. With 15 rounds MIT's graph ends at 2.49 m for 1.80, manhattan's
+at .50 for .47.
+"""
 
 
 def polished(reduced: Reduced, linear: Linear) -> tuple[Linear, Floats]:
@@ -37,7 +38,7 @@ def polished(reduced: Reduced, linear: Linear) -> tuple[Linear, Floats]:
     wide[rows] = loops_at_place(chain.places[rows]) ** CROWDED_POWER
     chain = replace(chain, covariance=chain.covariance * wide[:, None, None])
     weights = np.ones(count)
-    for _ in range(MOST_ROUNDS):
+    for _ in range(ROUNDS):
         weighted = replace(chain, covariance=chain.covariance / weights[:, None, None])
         fit = optimised(Fit(reduced, replace(linear, chain=weighted)), STEPS)
         linear, (residual, covariance) = fit.linear, fit.loops
