@@ -27,12 +27,12 @@ SOME_CYCLES = 4
 """Fewest cycles to bound errors by where fewer than `FEWEST` close."""
 COPIES = 1e-5
 """Share of the gate below which cycles join copies of one measurement and are no evidence."""
-NEARLY_ALL = 0.95
+COVERED = 0.95
 """Share of closing cycles: if the stated information explains so many, errors are scaled to cover as many."""
-MAXWELL_MEDIAN, MAXWELL_NEARLY_ALL = math.sqrt(MEDIAN_CHI2[3]), math.sqrt(chdtri(3, 1 - NEARLY_ALL))
+MAXWELL_MEDIAN, MAXWELL_COVERED = math.sqrt(MEDIAN_CHI2[3]), math.sqrt(chdtri(3, 1 - COVERED))
 """Quantiles of the length of a vector of three normal errors."""
 GAP = 5.0
-"""Factor on the error that `NEARLY_ALL` closing cycles stay below, beyond which cycles are apart from these. With 3 the
+"""Factor on the error that `COVERED` closing cycles stay below, beyond which cycles are apart from these. With 3 the
 cubicle's graph loses 185 right edges for 127.
 """
 HEAVY_TAILS = 1.9
@@ -99,7 +99,7 @@ def edge_noise(
     shift = shifted.scale(FIRST_GATE_SHARE * reach_m, prior, credible[1] if informed else usual[1])
     closes = (turned.error < FIRST_GATE_RAD) & (shifted.error < FIRST_GATE_SHARE * reach_m)
     sound = (turned.ratio < SIGMAS) & (shifted.ratio < SIGMAS)
-    if informed and closes.sum() >= FEWEST and sound[closes].mean() >= NEARLY_ALL:
+    if informed and closes.sum() >= FEWEST and sound[closes].mean() >= COVERED:
         turn = max(turn, turned.covering_scale(sound, closes))
         shift = max(shift, shifted.covering_scale(sound, closes))
     if not informed:
@@ -181,5 +181,5 @@ class _Errors:
         that close (L,): stated errors that are far too large would explain wrong edges too.
         """
         ratios = self.ratio[closes & (self.ratio > COPIES)]
-        limit = GAP * float(np.quantile(ratios, NEARLY_ALL)) if len(ratios) else np.inf
-        return float(np.quantile(self.ratio[sound & (self.ratio < limit)], NEARLY_ALL)) / MAXWELL_NEARLY_ALL
+        limit = GAP * float(np.quantile(ratios, COVERED)) if len(ratios) else np.inf
+        return float(np.quantile(self.ratio[sound & (self.ratio < limit)], COVERED)) / MAXWELL_COVERED

@@ -1,4 +1,4 @@
-"""Levels that several questions share, none of which is answered otherwise by a level a little lower or higher."""
+"""Levels that several questions of the backbone and of the diagnosis share."""
 
 from __future__ import annotations
 
@@ -13,6 +13,6 @@ NEARLY_ALL = 0.9
 RANDOM = 4000
 """Random pairs of places, from which distributions by chance are known to a few hundredths."""
 SIGMAS = 3.0
-"""Standard deviations, or usual errors, beyond which an error is no chance: one in 400."""
+"""Standard deviations, or usual errors, beyond which an error is no chance: a normal one in 400."""
 TOLERANCE = 1e-4
 """Relative tolerance of χ² of solves that only judge edges."""
