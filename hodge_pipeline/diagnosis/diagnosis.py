@@ -14,7 +14,7 @@ from hodge_pipeline.complex.closing import cycle_errors
 from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.complex.short_cycles import with_cycles_of
 from hodge_pipeline.diagnosis.consensus import agreeing, find_consensus, sought_from
-from hodge_pipeline.diagnosis.cycles import Cycles, is_folded, judge_cycles, witnesses
+from hodge_pipeline.diagnosis.cycles import Cycles, close_by_chance, is_folded, judge_cycles, witnesses
 from hodge_pipeline.diagnosis.evidence import Evidence, every_pair_tried, gather
 from hodge_pipeline.diagnosis.noise import Noise
 from hodge_pipeline.diagnosis.on_backbone import judged_on_backbone
@@ -131,11 +131,15 @@ class _ByCycles:
 
     @cached_property
     def explains_nothing(self) -> bool:
-        """Whether the sequence is folded, or meets none of its loops, which the drift of a long path hides: see
-        `is_folded`, `meets_no_loops`.
+        """Whether cycles close no better than by chance, the sequence is folded, or it meets none of its loops, which
+        the drift of a long path hides: `close_by_chance`, `is_folded`, `meets_no_loops`.
         """
-        found = self.found
-        return meets_no_loops(self.evidence, self.fit) or is_folded(self.stated, found.kept, found.world_from_cam)
+        known = self.evidence
+        if close_by_chance(self.cycles, known.graph.i_from_j, known.noise, known.reach_m):
+            return True
+        if meets_no_loops(known, self.fit):
+            return True
+        return is_folded(self.stated, self.found.kept, self.found.world_from_cam)
 
     @cached_property
     def fit(self) -> Solved:
