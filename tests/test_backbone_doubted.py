@@ -154,8 +154,8 @@ def test_poses_are_not_followed_to_where_loops_are_less_likely(monkeypatch: pyte
 
 def test_loops_are_judged_once_where_steps_err_as_usual(monkeypatch: pytest.MonkeyPatch) -> None:
     """Learned errors of less than twice the stated ones say nothing: judging by stated ones too takes as long again."""
-    judged = Mock(side_effect=inference.infer)
-    monkeypatch.setattr(bridged, "infer", judged)
+    judged = Mock(side_effect=inference.LoopJudge.infer)
+    monkeypatch.setattr(inference.LoopJudge, "infer", lambda *given: judged(*given))
     backbone = find_backbone(drive(seed=3, wrong=0.3, misstated=(0.7, 1.0)).graph)
     assert backbone is not None and 1.0 < backbone.found.scales.of_steps < 2.0
     assert judged.call_count == 1

@@ -16,7 +16,7 @@ from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.refine.pose_graph import read_graph
 from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced
-from hodge_pipeline.solvers.backbone.inference import _Trial
+from hodge_pipeline.solvers.backbone.inference import LoopJudge, _Trial
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.places import Arrangement, Places
 from hodge_pipeline.solvers.backbone.scales import Scales
@@ -80,7 +80,7 @@ def test_places_whose_loops_are_not_confirmed_again_are_not_likely(monkeypatch: 
 
     monkeypatch.setattr(_Trial, "agreed", once)
     outliers, none = OutlierModel.of(chain), np.zeros(len(chain.ends), bool)
-    trial = _Trial.of(chain, outliers, none, True, Scales(), EVEN)
+    trial = _Trial.of(chain, LoopJudge(outliers, none, True), Scales(), EVEN)
     settled = trial.settled(*trial.grown(trial.standing_out, trial.start, trial.shares))
     assert len(found) == 2 and not settled.confirmed
     assert settled.of_places == -np.inf

@@ -35,9 +35,6 @@ from hodge_pipeline.solvers.weights import OUT_OF_PLANE, dimension_of
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 DEFAULTS = DiagnosisOptions()
-LIKELIER_RIGHT = 0.5
-"""Least probability by the solution of an edge that shares the blame and is untestable: one below is wrong or suspect.
-"""
 
 
 @one_blas_thread
@@ -164,10 +161,9 @@ class _ByCycles:
         agrees = agreeing(evidence, fit)
         cycles = _with_witnesses(self.cycles, fit.used, evidence)
         blame = share_blame(cycles, fit, evidence)
-        unconfirmed = blame.unconfirmed & (agrees >= LIKELIER_RIGHT)
-        untestable = evidence.in_no_listed_cycle | blame.undecided | unconfirmed
+        untestable = evidence.in_no_listed_cycle | blame.undecided | blame.unconfirmed
         probability = np.where(untestable, np.nan, np.maximum(agrees, blame.probability))
-        undecided = np.where(unconfirmed | (blame.probability > 0) | blame.undecided, blame.cycle, -1)
+        undecided = np.where(blame.unconfirmed | (blame.probability > 0) | blame.undecided, blame.cycle, -1)
         right = (probability >= CONSISTENT_FROM) & fit.used
         wrong = probability < WRONG_BELOW
         verdict = np.select([untestable, right, wrong], [UNTESTABLE, CONSISTENT, WRONG], SUSPECT)

@@ -11,6 +11,7 @@ from scipy.special import chdtri
 from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import MEDIAN_CHI2, has_unit_information, mean_variances
 from hodge_pipeline.complex.cycles import Loops
+from hodge_pipeline.solvers.backbone.levels import FEWEST, SIGMAS
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 DEFAULT_ANGLE_RAD, DEFAULT_SHARE = 0.03, 0.05
@@ -22,22 +23,22 @@ FIRST_GATE_RAD, FIRST_GATE_SHARE = 0.35, 0.6
 """Gates of cycles that errors are estimated from; of translation as a share of the reach."""
 LONGEST_CYCLE = 4
 """Most edges of those: errors of longer cycles add up until any seems to close."""
-FEWEST_CYCLES, SOME_CYCLES = 20, 4
-"""Fewest closing cycles to estimate errors from, and fewest cycles to bound them where fewer close."""
+SOME_CYCLES = 4
+"""Fewest cycles to bound errors by where fewer than `FEWEST` close."""
 COPIES = 1e-5
 """Share of the gate below which cycles join copies of one measurement and are no evidence."""
-STATED = 3.0
-"""Closing error, in standard deviations by the stated information, up to which this explains a cycle."""
-NEARLY_ALL = 0.95
+COVERED = 0.95
 """Share of closing cycles: if the stated information explains so many, errors are scaled to cover as many."""
-MAXWELL_MEDIAN, MAXWELL_NEARLY_ALL = math.sqrt(MEDIAN_CHI2[3]), math.sqrt(chdtri(3, 1 - NEARLY_ALL))
+MAXWELL_MEDIAN, MAXWELL_COVERED = math.sqrt(MEDIAN_CHI2[3]), math.sqrt(chdtri(3, 1 - COVERED))
 """Quantiles of the length of a vector of three normal errors."""
 GAP = 5.0
-"""Factor on the error that `NEARLY_ALL` closing cycles stay below, beyond which cycles are apart from these."""
+"""Factor on the error that `COVERED` closing cycles stay below, beyond which cycles are apart from these. With 3 the
+cubicle's graph loses 185 right edges for 127.
+"""
 HEAVY_TAILS = 1.9
 """Factor on a Gaussian's standard deviation of the same median: errors of registration have heavier tails."""
-LEAST_CREDIBLE, MOST_CREDIBLE, NOTED_FROM = 0.2, 2.5, 2.0
-"""Bounds of a credible stated error in units of the default; and the correction from which a note reports it."""
+LEAST_CREDIBLE = 0.2
+"""Least credible stated error in units of the default; the largest is `SIGMAS` times that."""
 LEVER = 1.8
 """Radius of what is seen about the working point, in reaches, at which an error of rotation acts as one of translation.
 """
@@ -97,14 +98,14 @@ def edge_noise(
     turn = turned.scale(FIRST_GATE_RAD, prior, credible[0] if informed else usual[0])
     shift = shifted.scale(FIRST_GATE_SHARE * reach_m, prior, credible[1] if informed else usual[1])
     closes = (turned.error < FIRST_GATE_RAD) & (shifted.error < FIRST_GATE_SHARE * reach_m)
-    sound = (turned.ratio < STATED) & (shifted.ratio < STATED)
-    if informed and closes.sum() >= FEWEST_CYCLES and sound[closes].mean() >= NEARLY_ALL:
+    sound = (turned.ratio < SIGMAS) & (shifted.ratio < SIGMAS)
+    if informed and closes.sum() >= FEWEST and sound[closes].mean() >= COVERED:
         turn = max(turn, turned.covering_scale(sound, closes))
         shift = max(shift, shifted.covering_scale(sound, closes))
     if not informed:
         shift = max(shift, LEVER * turn * reach_m)
     taken = turn == credible[0], shift == credible[1]
-    changed = any(own and not 1 / NOTED_FROM < by < NOTED_FROM for own, by in zip(taken, credible, strict=True))
+    changed = any(own and not 1 / SIGMAS < by < SIGMAS for own, by in zip(taken, credible, strict=True))
     is_reported = informed and changed and any_cycle
     doubts = (_doubt(stated, (turn * stated[0], shift * stated[1])),) if is_reported else ()
     return Noise(_scaled(turn, rotation, own[0]), _scaled(shift, translation, own[1]), doubts)
@@ -124,7 +125,7 @@ def _median(deviation: Floats) -> float:
 
 def _credible(stated: float, usual: float, median_scale: float) -> float:
     """The factor that makes a stated error credible beside a `usual` one and one `shown` by cycles; 1 if it is."""
-    if stated > MOST_CREDIBLE * usual:
+    if stated > SIGMAS * usual:
         return min(max(usual / stated, median_scale), 1.0)
     return max(1.0, LEAST_CREDIBLE * usual / stated)
 
@@ -161,7 +162,7 @@ class _Errors:
     def scale(self, gate: float, prior: Floats, fallback: float) -> float:
         """The scale at which half of the cycles that close have an error below the median of its distribution."""
         closes = (self.error > COPIES * gate) & (self.error < gate)
-        if closes.sum() < FEWEST_CYCLES:
+        if closes.sum() < FEWEST:
             return fallback
         weight = np.exp(self.loops.sums(np.log(prior)))[closes]
         order = np.argsort(self.ratio[closes])
@@ -180,5 +181,5 @@ class _Errors:
         that close (L,): stated errors that are far too large would explain wrong edges too.
         """
         ratios = self.ratio[closes & (self.ratio > COPIES)]
-        limit = GAP * float(np.quantile(ratios, NEARLY_ALL)) if len(ratios) else np.inf
-        return float(np.quantile(self.ratio[sound & (self.ratio < limit)], NEARLY_ALL)) / MAXWELL_NEARLY_ALL
+        limit = GAP * float(np.quantile(ratios, COVERED)) if len(ratios) else np.inf
+        return float(np.quantile(self.ratio[sound & (self.ratio < limit)], COVERED)) / MAXWELL_COVERED

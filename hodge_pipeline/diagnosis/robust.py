@@ -21,6 +21,7 @@ from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, backbone_or_diagnosis, 
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.robust_priors import excess_of_priors, left_out_note, right_priors
+from hodge_pipeline.solvers.backbone.levels import SIGMAS
 from hodge_pipeline.solvers.backbone.trust import Backbone
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.reweighted import reweighted
@@ -29,8 +30,6 @@ from hodge_pipeline.solvers.weights import PLANAR_AXES, dimension_of, edge_weigh
 from hodge_pipeline.types import Bools, Floats, Solution, ViewGraph
 from hodge_pipeline.types.text import counted
 
-SIGMAS = 3.0
-"""Standard deviations, √(2 degrees of freedom), by which χ² may exceed its mean where stated errors explain it."""
 Solver: TypeAlias = Callable[[ViewGraph, Floats], Solution]
 """The maximum-likelihood solution of a graph, from poses (V, 4, 4)."""
 
@@ -129,7 +128,7 @@ def _without_backbone(graph: ViewGraph, found: Diagnosis, solved: Solver) -> Sol
 
 def is_explained(graph: ViewGraph, solution: Solution) -> bool:
     """Whether the χ² of the maximum-likelihood solution of all edges agrees with its degrees of freedom; False where
-    the information is the identity that stands for unknown.
+    the information is the identity that stands for unknown. Its standard deviation is √(2 degrees of freedom).
     """
     if has_unit_information(graph):
         return False

@@ -10,8 +10,10 @@ from scipy.special import chdtri
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import chi2_by_information, tail_gate, tail_weight
+from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.priors import with_world
+from hodge_pipeline.solvers.reweighted import SETTLED
 from hodge_pipeline.solvers.weights import PLANAR_AXES, UNUSED_PRIOR, dimension_of, edge_weights
 from hodge_pipeline.types import Bools, Floats, Ints, Priors, ViewGraph
 from hodge_pipeline.types.text import counted, suiting
@@ -23,10 +25,6 @@ MOST_WRONG = 0.5
 MOST_EXCESS = 3.0
 """Edges and priors may be off by so many times what they state. Edges are by at most 1.0 times in twenty graphs of the
 literature and of SLAM without wrong edges or with few, by 8 and 11 times in Bicocca's with most of its wrong loops.
-"""
-ROUNDS, SETTLED = 30, 1e-2
-"""Most reweighted solves, a limit on cost, and the largest change of a weight that ends them. With a fifth of 40
-positions wrong by 30 m, 5 to 12 settle.
 """
 
 
@@ -42,7 +40,7 @@ def right_priors(graph: ViewGraph, priors: Priors, solved: Callable[[ViewGraph],
     size = np.maximum(axes, 1)  # a prior that states nothing has a χ² of 0
     gate = np.array([tail_gate(each, min(LEAST_SHARE, 1 / len(axes))) for each in size.tolist()])
     middle = np.asarray(chdtri(size, 0.5))
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROUNDS):
         weighted = replace(priors, information=weights[:, None, None] * priors.information)
         chi2 = chi2_of_priors(graph, priors, solved(replace(graph, priors=weighted)))
         if (chi2 <= gate).all():

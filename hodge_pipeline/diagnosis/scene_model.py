@@ -16,18 +16,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import expit
 
-from hodge_pipeline.diagnosis.evidence import Evidence
+from hodge_pipeline.diagnosis.evidence import CEILING, Evidence
 from hodge_pipeline.diagnosis.robust_poses import Solved
+from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS
 from hodge_pipeline.types import Bools, Floats, Ints
 
-CEILING = 0.97
-"""Probability that two views at one pose are joined."""
 USUAL, SPREAD = np.array([6.0, np.log(2.5), np.log(2.7)]), np.array([2.0, 0.5, 0.5])
 """The means of the prior on the parameters of `Joining`, and their standard deviations."""
 LEAST_SPREAD_RAD = 0.2
 """Least spread of up: chained poses drift by as much, however upright the cameras were."""
-ROUNDS, STEPS = 8, 5
-"""Iterations of the fit, and of the up of each group: limits on cost."""
 CLEAR_SHARE, CLEAR_SPREAD_RAD = 0.8, 0.42
 """The least share and the largest spread of a model that is used; else its share becomes 0."""
 STARTS = np.concatenate([np.eye(3), np.array([[0, 1, 1], [0, -1, 1]]) / np.sqrt(2)])
@@ -98,7 +95,7 @@ class Upright:
         """The direction (V, 3) that is up where each camera is: the one of its piece that suits the cameras there."""
         pointing, count = rotations @ self.up, int(piece.max(initial=-1)) + 1
         weight = np.ones(len(piece))
-        for _ in range(STEPS):
+        for _ in range(MOST_ROUNDS):
             sums = [np.bincount(piece, weight * pointing[:, axis], count) for axis in range(3)]
             mean = np.stack(sums, axis=1)
             mean = mean / np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
@@ -134,7 +131,7 @@ def learn_upright(rotations: Floats, neighbours: Ints) -> Upright:
 def _fitted_from(model: Upright, rotations: Floats, piece: Ints) -> tuple[float, Upright]:
     """The log-likelihood, and the model that the rounds lead to."""
     up = model.world_up(rotations, piece)
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROUNDS):
         follows = model.following(rotations, up)
         seen = np.einsum("nij,ni->nj", rotations, up)
         mean = follows @ seen

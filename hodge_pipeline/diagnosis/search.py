@@ -22,12 +22,11 @@ from hodge_pipeline.diagnosis.growth import PER_FOLD, Alignment, agreement_of, m
 from hodge_pipeline.diagnosis.placement import Placements, consecutive_log_evidence, log_evidence
 from hodge_pipeline.diagnosis.robust_poses import ONCE, Solved, fit
 from hodge_pipeline.diagnosis.scene_model import learn_scene_model
+from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS
 from hodge_pipeline.types import Bools, Floats, Ints
 
 LARGEST = 150
 """Most views that are searched with all their pairs: a limit on cost."""
-ROUNDS = 10
-"""Rounds of moves: a limit on cost."""
 TRIED, TOGETHER = 200, 50_000
 """Motions tried in each round; and pairs of views over all motions of a batch, up to which the overhead of a call
 dominates.
@@ -61,7 +60,7 @@ def searched(evidence: Evidence, found: Solved) -> Solved:
     Without a scene model, a round must also raise the number of used edges, each weighted by 1 − log(1 − prior).
     """
     each = 1 - np.log1p(-evidence.prior)
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROUNDS):
         model = learn_scene_model(evidence, found) if evidence.exhaustive else None
         moves = _moves(Placements.of(evidence, found, model))
         tried = fit(evidence, _applied(found, moves), ONCE) if moves else found

@@ -8,8 +8,9 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import FREEDOM, STUDENT_99, tail_weight
-from hodge_pipeline.solvers.backbone.evidence import mahalanobis, student_log_density
+from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, mahalanobis, student_log_density
 from hodge_pipeline.solvers.backbone.fit import Fit
+from hodge_pipeline.solvers.backbone.levels import MOST_TRIED
 from hodge_pipeline.solvers.backbone.linear import linearise, turned
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.step_model import StepModel
@@ -17,10 +18,6 @@ from hodge_pipeline.types import Bools, Floats, Ints
 
 PLATEAU = 12.0
 """Nats below the best step at which a step is no candidate for the break."""
-MOST_UNUSUAL = 3
-"""Steps that are tried by their own size alone: a limit on cost."""
-LEAST_COST = 4.0
-"""Nats that the residual of a run must cost before its steps are tested: a limit on time."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +101,7 @@ def _shifted_aside(pairwise: PairwiseConsistency, usual: StepModel, loop: int, a
 def unusual_breaks(usual: StepModel) -> list[Break]:
     """Breaks at the most unusual steps, the most unusual first, whatever the loops say; `log_evidence` is `unusual`."""
     rows = np.argsort(-usual.unusual)
-    return [Break(int(at), usual.centre, usual.covariance, float(usual.unusual[at])) for at in rows[:MOST_UNUSUAL]]
+    return [Break(int(at), usual.centre, usual.covariance, float(usual.unusual[at])) for at in rows[:MOST_TRIED]]
 
 
 @dataclass(frozen=True)
@@ -155,11 +152,11 @@ class Runs:
         return out
 
     def likeliest_break(self) -> Break | None:
-        """The likeliest broken step of runs whose residual costs more than `LEAST_COST`; None without such a run.
+        """The likeliest broken step of runs whose residual costs more than chance does; None without such a run.
 
         Many loops on either side hide a break from each other, not from the run between them.
         """
-        costly = np.flatnonzero(self.cost > LEAST_COST)
+        costly = np.flatnonzero(self.cost > BY_CHANCE)
         if not len(costly):
             return None
         at = np.concatenate([np.arange(low + 1, high + 1) for low, high in self.pairwise.chain.ends[costly].tolist()])

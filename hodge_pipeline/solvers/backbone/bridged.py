@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -13,17 +12,10 @@ from hodge_pipeline.solvers.backbone.bias import without_bias
 from hodge_pipeline.solvers.backbone.breaks import Break, Runs, agreed_breaks, unusual_breaks
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mixture
-from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, optimised
-from hodge_pipeline.solvers.backbone.inference import (
-    Inferred,
-    by_chance,
-    infer,
-    is_crumpled,
-    refused,
-    refused_alike,
-    without,
-)
+from hodge_pipeline.solvers.backbone.fit import Fit, optimised
+from hodge_pipeline.solvers.backbone.inference import Inferred, LoopJudge, by_chance
 from hodge_pipeline.solvers.backbone.judge import densities
+from hodge_pipeline.solvers.backbone.levels import MOST_TRIED
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
 from hodge_pipeline.solvers.backbone.mistakes import shared_shift, without_shift
@@ -49,41 +41,38 @@ SMALLER, OF_A_SHIFT = (1 / 4, 1 / 16), 3 * BY_CHANCE
 """Factors on the learned errors by which mistaken loops are found; with the smaller alone 286 wrong ones of `alike` are
 kept for 38. And the nats that a shift which they share must gain, more than chance for each of its axes.
 """
-DRAWN = 3
-"""Times that the motions of loops are drawn at random."""
 
 
 def infer_bridged(
     chain: Chain,
     trusted: Bools,
+    *,
     may_thin: bool,
-    most: int = MOST_BREAKS,
-    is_sought: Callable[[Inferred], bool] = lambda unbroken: True,
+    most: int,
+    is_sought: Callable[[Inferred], bool],
 ) -> tuple[Chain, Inferred] | None:
     """The chain with its paths joined, without the bias of its steps where this confirms loops, and with up to `most`
-    broken steps bridged, and its loops judged; None as in `infer`.
+    broken steps bridged, and its loops judged; see `LoopJudge` for `trusted (M,)`, `may_thin` and None.
 
     A step is tried where loops of several places agree that it is broken, or where it is unlike all others. It is
     broken where all loops are likelier with a bridge in its place: by more than chance would have them be. `is_sought`:
     whether breaks should be sought, by the loops judged without any.
     """
     chain = joined(chain)
-    outliers = OutlierModel.of(chain)  # one for all trials, which makes their evidence comparable
-    judge = partial(infer, outliers=outliers, trusted=trusted, may_thin=may_thin)
+    by = LoopJudge(OutlierModel.of(chain), trusted, may_thin)
 
     def judged(unbroken: Chain, first: Inferred) -> tuple[Chain, Inferred]:
-        return _bridged(unbroken, first, judge, outliers, trusted, most if most and is_sought(first) else 0)
+        return _bridged(unbroken, first, by, most if most and is_sought(first) else 0)
 
-    first = judge(chain)
+    first = by.infer(chain)
     if first is None:
         return None
-    found = judged(chain, first)
-    found = _without_shared_shifts(chain, found, judge, outliers, trusted)
+    found = _without_shared_shifts(chain, judged(chain, first), by)
     parted = without_bias(chain.parted(), first.scales)  # bridges between paths lead as biased steps do
     if parted is None:
         return found
     unbiased = joined(parted)
-    second = judge(unbiased)
+    second = by.infer(unbiased)
     if second is None:
         return found
     other = judged(unbiased, second)
@@ -91,42 +80,29 @@ def infer_bridged(
     return other if other[1].confirmed and other[1].of_places > least else found
 
 
-def _bridged(
-    unbroken: Chain,
-    first: Inferred,
-    judge: Callable[..., Inferred | None],
-    outliers: OutlierModel,
-    trusted: Bools,
-    most: int,
-) -> tuple[Chain, Inferred]:
+def _bridged(unbroken: Chain, first: Inferred, by: LoopJudge, most: int) -> tuple[Chain, Inferred]:
     """The chain with up to `most` broken steps bridged, and its loops judged; `first`: as they are without."""
     chain = unbroken
-    as_stated = _as_stated(chain, first, judge)
+    as_stated = _as_stated(chain, first, by)
     if as_stated is not None and _believed(as_stated, first):
         first, as_stated = as_stated, None
     found = first
     for _ in range(most):
-        better = _better(chain, found, as_stated, judge, outliers)
+        better = _better(chain, found, as_stated, by)
         if better is None:
             break
         chain, found = better
-        as_stated = _as_stated(chain, found, judge)
+        as_stated = _as_stated(chain, found, by)
     # a break found by unconfirmed loops is not confirmed either
     for one, other in [(chain, found)] if found is first else [(chain, found), (unbroken, first)]:
-        if not other.confirmed or is_crumpled(other, outliers):
+        if not other.confirmed or by.is_crumpled(other):
             continue
-        if not (_contradicted(other) and _random_motions_do_as_well(one, other, trusted, judge)):
+        if not (_contradicted(other) and _random_motions_do_as_well(one, other, by)):
             return one, other
-    return unbroken, refused(first, trusted)
+    return unbroken, by.refused(first)
 
 
-def _without_shared_shifts(
-    unbroken: Chain,
-    found: tuple[Chain, Inferred],
-    judge: Callable[..., Inferred | None],
-    outliers: OutlierModel,
-    trusted: Bools,
-) -> tuple[Chain, Inferred]:
+def _without_shared_shifts(unbroken: Chain, found: tuple[Chain, Inferred], by: LoopJudge) -> tuple[Chain, Inferred]:
     """The chain and its loops without those that take a place for one that looks alike, by a shift that many share;
     what was `found` where all loops are not likelier without that shift.
 
@@ -136,20 +112,13 @@ def _without_shared_shifts(
     """
     apart, best, mistaken = unbroken, found[1], np.zeros(len(unbroken.ends), bool)
     for factor in SMALLER if len(mistaken) <= JUDGED_TWICE else ():
-        while (better := _without_shift(apart, best, factor, judge, outliers, trusted)) is not None:
+        while (better := _without_shift(apart, best, factor, by)) is not None:
             apart, best, rows = better
             mistaken[rows] = True
-    return (unbroken, without(best, unbroken, mistaken, outliers, trusted)) if mistaken.any() else found
+    return (unbroken, by.without(best, unbroken, mistaken)) if mistaken.any() else found
 
 
-def _without_shift(
-    chain: Chain,
-    found: Inferred,
-    factor: float,
-    judge: Callable[..., Inferred | None],
-    outliers: OutlierModel,
-    trusted: Bools,
-) -> tuple[Chain, Inferred, Ints] | None:
+def _without_shift(chain: Chain, found: Inferred, factor: float, by: LoopJudge) -> tuple[Chain, Inferred, Ints] | None:
     """The chain without the shift that loops refused by errors smaller by a factor share, its loops judged, and which
     these are (rows); None where all loops are not likelier so.
     """
@@ -157,7 +126,7 @@ def _without_shift(
         return None
     used = np.flatnonzero(found.used)
     some = chain.with_loops(used, chain.ends[used])
-    linear, shared = refused_alike(some, outliers, trusted[used], found.scales.times(factor))
+    linear, shared = by.select(used).refused_alike(some, found.scales.times(factor))
     if shared is None or shared.nats < OF_A_SHIFT:
         return None
     rows = used[shared.rows]
@@ -165,12 +134,12 @@ def _without_shift(
     if 2 * alike < len(rows):
         return None
     apart = without_shift(chain, linear.poses, rows, shift)
-    same = judge(apart, scales=found.scales)  # so that nothing but the shift differs
+    same = by.infer(apart, found.scales)  # so that nothing but the shift differs
     if same is None or not same.confirmed or same.log_evidence <= found.log_evidence:
         return None
     if same.of_places < found.of_places + OF_A_SHIFT:
         return None
-    again = judge(apart)
+    again = by.infer(apart)
     if again is None or not again.confirmed or again.log_evidence < same.log_evidence:
         again = same
     return apart, again, rows
@@ -182,25 +151,23 @@ def _contradicted(found: Inferred) -> bool:
     return bool(loops_at_place(places[used]).sum() < CONTRADICTED * loops_at_place(places)[used].sum())
 
 
-def _random_motions_do_as_well(
-    chain: Chain, found: Inferred, trusted: Bools, judge: Callable[..., Inferred | None]
-) -> bool:
+def _random_motions_do_as_well(chain: Chain, found: Inferred, by: LoopJudge) -> bool:
     """Whether loops between the same places reach as much log-evidence with motions drawn from a normal distribution as
-    wide as that of the measured ones; those of `trusted (M,)` loops stay.
+    wide as that of the measured ones; those of trusted loops stay.
     """
     rng, twists = np.random.default_rng(4), chain.log(chain.motion)
     middle = np.median(twists, axis=0)
     spread = np.median(np.abs(twists - middle), axis=0) / np.sqrt(MEDIAN_CHI2[1])
-    for _ in range(DRAWN):
+    for _ in range(MOST_TRIED):
         drawn = chain.exp(middle + spread * rng.standard_normal(twists.shape))
-        motion = np.where(trusted[:, None, None], chain.motion, drawn)
-        other = judge(replace(chain, motion=motion), scales=found.scales)
+        motion = np.where(by.trusted[:, None, None], chain.motion, drawn)
+        other = by.infer(replace(chain, motion=motion), found.scales)
         if other is not None and other.log_evidence > found.log_evidence - BY_CHANCE:
             return True
     return False
 
 
-def _as_stated(chain: Chain, found: Inferred, judge: Callable[..., Inferred | None]) -> Inferred | None:
+def _as_stated(chain: Chain, found: Inferred, by: LoopJudge) -> Inferred | None:
     """The loops judged with errors no larger than stated, where learned ones are larger or confirm no loop; else None.
 
     A break under all loops looks like larger errors of all steps, and many loops that join right places by a wrong
@@ -209,7 +176,7 @@ def _as_stated(chain: Chain, found: Inferred, judge: Callable[..., Inferred | No
     scales = found.scales.at_most_stated if chain.stated else Scales()
     may_take_long = found.scales.surprise or len(chain.ends) <= JUDGED_TWICE
     larger = chain.stated and found.scales.exceed_stated and may_take_long
-    return judge(chain, scales=scales) if found.scales != scales and (larger or not found.confirmed) else None
+    return by.infer(chain, scales) if found.scales != scales and (larger or not found.confirmed) else None
 
 
 def _believed(as_stated: Inferred, found: Inferred) -> bool:
@@ -221,28 +188,22 @@ def _believed(as_stated: Inferred, found: Inferred) -> bool:
     return not found.confirmed or as_stated.of_mistakes > found.of_mistakes + BY_CHANCE
 
 
-def _better(
-    chain: Chain,
-    found: Inferred,
-    as_stated: Inferred | None,
-    judge: Callable[..., Inferred | None],
-    outliers: OutlierModel,
-) -> tuple[Chain, Inferred] | None:
+def _better(chain: Chain, found: Inferred, as_stated: Inferred | None, by: LoopJudge) -> tuple[Chain, Inferred] | None:
     """The chain with one more broken step bridged, and its loops judged; None where no step is broken."""
     surprising = found.scales.surprise or not found.confirmed
     founds = [found] if as_stated is None or not surprising else [found, as_stated]
-    for broken, least in [each for one in founds for each in _candidates(chain, one, outliers)]:
+    for broken, least in [each for one in founds for each in _candidates(chain, one)]:
         tried = bridged(chain, broken)
-        same = judge(tried, scales=found.scales)  # so that nothing but the step differs
+        same = by.infer(tried, found.scales)  # so that nothing but the step differs
         if same is None or same.log_evidence <= found.log_evidence + least:
             continue
         if broken.usual or same.start.chain.corridors_over(broken.at, np.flatnonzero(same.used)) > 1:
-            again = judge(tried)
+            again = by.infer(tried)
             return tried, same if again is None or again.log_evidence < same.log_evidence else again
     return None
 
 
-def _candidates(chain: Chain, found: Inferred, outliers: OutlierModel) -> list[tuple[Break, float]]:
+def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
     """Breaks to try, each with the log-evidence that the loops must gain by it beside its own."""
     linear, factor = found.start, found.judged.factor
     shares = np.log(mixture(factor)[0])
@@ -255,7 +216,7 @@ def _candidates(chain: Chain, found: Inferred, outliers: OutlierModel) -> list[t
     unlike = [each for each in unusual_breaks(usual) if each.log_evidence > BY_CHANCE]
     candidates = [(each, least) for each in agreed[:TRIED_AT_ONCE] if each is agreed[0] or each.at != agreed[0].at]
     if len(found.reduced.runs):
-        runs = Runs.of(optimised(Fit(found.reduced, found.linear), MOST_STEPS), linear.poses, usual)
+        runs = Runs.of(optimised(Fit(found.reduced, found.linear)), linear.poses, usual)
         of_run, scores = runs.likeliest_break(), runs.score(np.array([each.at for each in unlike], np.int64))
         unlike = [each for each, score in zip(unlike, scores, strict=True) if score > BY_CHANCE]
         if of_run is not None and of_run.log_evidence > BY_CHANCE:

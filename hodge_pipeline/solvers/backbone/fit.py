@@ -15,6 +15,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.chain import Chain
+from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS
 from hodge_pipeline.solvers.backbone.linear import Linear, cholesky, inverse, linearise, loops_at
 from hodge_pipeline.solvers.backbone.sparse import Factored, NormalEquations
 from hodge_pipeline.solvers.maximum_likelihood import solve
@@ -249,11 +250,7 @@ share of χ² that a step must then gain.
 """
 
 
-MOST_STEPS = 15
-"""Gauss–Newton steps: a limit on cost."""
-
-
-def optimised(fit: Fit, steps: int) -> Fit:
+def optimised(fit: Fit, steps: int = MOST_ROUNDS) -> Fit:
     """The fit after up to `steps` of Gauss–Newton with halving, until the predicted decrease of χ² is below
     `LEAST_WON`, or below `SHARE_WON` of χ² where loops contradict each other.
     """
@@ -275,11 +272,11 @@ def optimised(fit: Fit, steps: int) -> Fit:
     return fit
 
 
-def from_rotations(bare: Fit, steps: int) -> Linear:
+def from_rotations(bare: Fit) -> Linear:
     """The chain at the poses of its reduced graph, solved from chordal rotations, which need no start.
 
-    `steps`: at most, as loops that contradict each other may take hundreds; `bare`: the fit at the chain's own poses,
-    where the motions of runs are edges.
+    `bare`: the fit at the chain's own poses, where the motions of runs are edges. In few steps, as loops that
+    contradict each other may take hundreds.
     """
     chain, reduced, poses = bare.linear.chain, bare.reduced, bare.linear.poses[bare.reduced.ends]
     first, second = reduced.runs.T
@@ -290,7 +287,7 @@ def from_rotations(bare: Fit, steps: int) -> Linear:
     information = np.zeros((len(motion), 6, 6))
     information[:, chain.axes[:, None], chain.axes] = of_axes
     graph = ViewGraph.from_edges(np.arange(len(poses)), reduced.network.edges, motion, information)
-    found = solve(graph, start=poses, dimension=3 if chain.is_spatial else 2, max_iterations=steps)
+    found = solve(graph, start=poses, dimension=3 if chain.is_spatial else 2, max_iterations=MOST_ROUNDS)
     return linearise(chain, bare.moved(found.world_from_cam @ se3.inverse(poses)))
 
 

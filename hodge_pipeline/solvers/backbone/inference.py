@@ -13,15 +13,16 @@ from hodge_pipeline.complex.chi2 import STUDENT_99
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, EVEN, OutlierModel, mahalanobis, mixture
-from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, Reduced, from_rotations, optimised, thinned
+from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, from_rotations, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, densities, judge
+from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.mistakes import Mistake, mistakes
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
-from hodge_pipeline.solvers.backbone.places import CHANCES, MISTAKEN, Places
+from hodge_pipeline.solvers.backbone.places import MISTAKEN, Places, factors_by_chance
 from hodge_pipeline.solvers.backbone.polish import polished
-from hodge_pipeline.solvers.backbone.scales import Scales, decoys, learned_scales
+from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
 from hodge_pipeline.types import Bools, Floats, Ints
 
 ROUNDS = 6
@@ -74,64 +75,83 @@ class Inferred:
         return polished(self.reduced, self.linear)
 
 
-def infer(
-    chain: Chain, outliers: OutlierModel, trusted: Bools, may_thin: bool, scales: Scales | None = None
-) -> Inferred | None:
-    """The loops of a chain, judged; those of `trusted (M,)` are used in any case.
+@dataclass(frozen=True)
+class LoopJudge:
+    """What judges the loops of a graph on one chain after another.
 
-    `may_thin`: where the right loops leave more than `MOST_UNKNOWNS`, all are judged at the poses of some of them;
-    without it None comes back then. `scales`: of the errors; by default those learned from the loops by which their
-    places are likelier, and learned anew at the poses that they lead to where the drift of a long path had hidden how
-    loops err: where scales there differ much, other loops agree by them, and the places are likelier.
+    - `outliers`: of the first chain, for all, which makes their evidence comparable; `trusted (M,)`: loops that are
+      used in any case.
+    - `may_thin`: where the right loops leave more than `MOST_UNKNOWNS`, all are judged at the poses of some of them;
+      without it nothing is inferred then.
     """
-    learned = learned_scales(chain, outliers) if scales is None else [(scales, EVEN)]
-    found: Inferred | None = None
-    for given in learned:
-        other = _Trial.of(chain, outliers, trusted, may_thin, *given).found()
-        if other is None:
-            return None
-        found = other if found is None or other.rank > found.rank else found
-    for _ in range(MOST_ANEW if scales is None else 0):
-        if found is None or not found.confirmed:
-            break
-        here = found.scales.at_solution(Fit(found.reduced, found.linear))
-        if not found.scales.differ_much(here) or not _others_agree(found, here.applied(chain), outliers, trusted):
-            break
-        other = _Trial.of(chain, outliers, trusted, may_thin, here, EVEN).found()
-        if other is None or other.rank <= found.rank:
-            break
-        found = other
-    return found
 
+    outliers: OutlierModel
+    trusted: Bools
+    may_thin: bool
 
-def refused_alike(
-    chain: Chain, outliers: OutlierModel, trusted: Bools, scales: Scales
-) -> tuple[Linear, Mistake | None]:
-    """The poses that the loops lead to which agree by errors of these scales, and a mistake that others share."""
-    trial = _Trial.of(chain, outliers, trusted, True, scales, EVEN)
-    used, rated = trial.grown(trial.standing_out, trial.start, EVEN)
-    log_wrong = densities(rated.linear, np.arange(len(used)), outliers)[1]
-    return rated.linear, next(mistakes(rated.linear, log_wrong, used), None)
+    def select(self, rows: Ints) -> LoopJudge:
+        """What judges the loops `rows (K,)` alone."""
+        return replace(self, trusted=self.trusted[rows])
 
+    def infer(self, chain: Chain, scales: Scales | None = None) -> Inferred | None:
+        """The loops of a chain, judged; None where they may not be thinned and are too many.
 
-def without(found: Inferred, chain: Chain, out: Bools, outliers: OutlierModel, trusted: Bools) -> Inferred:
-    """The result without the loops `out (M,)`, whose motions are those of `chain`; those of `trusted (M,)` stay."""
-    trial = _Trial.of(chain, outliers, trusted, True, found.scales, EVEN)
-    linear = replace(found.linear, chain=trial.start.chain)
-    return trial.final(found.used & ~out | trusted, EVEN, linear, found.confirmed, found.of_places)
+        `scales`: of the errors; by default those learned from the loops by which their places are likelier, and learned
+        anew at the poses that they lead to where the drift of a long path had hidden how loops err: where scales there
+        differ much, other loops agree by them, and the places are likelier.
+        """
+        learned = learned_scales(chain, self.outliers) if scales is None else [(scales, EVEN)]
+        found: Inferred | None = None
+        for given in learned:
+            other = _Trial.of(chain, self, *given).found()
+            if other is None:
+                return None
+            found = other if found is None or other.rank > found.rank else found
+        for _ in range(MOST_ANEW if scales is None else 0):
+            if found is None or not found.confirmed:
+                break
+            here = found.scales.at_solution(Fit(found.reduced, found.linear))
+            if not found.scales.differ_much(here) or not self._others_agree(found, here.applied(chain)):
+                break
+            other = _Trial.of(chain, self, here, EVEN).found()
+            if other is None or other.rank <= found.rank:
+                break
+            found = other
+        return found
 
+    def refused_alike(self, chain: Chain, scales: Scales) -> tuple[Linear, Mistake | None]:
+        """The poses that the loops lead to which agree by errors of these scales, and a mistake that others share."""
+        trial = _Trial.of(chain, self, scales, EVEN)
+        used, rated = trial.grown(trial.standing_out, trial.start, EVEN)
+        log_wrong = densities(rated.linear, np.arange(len(used)), self.outliers)[1]
+        return rated.linear, next(mistakes(rated.linear, log_wrong, used), None)
 
-def is_crumpled(found: Inferred, outliers: OutlierModel) -> bool:
-    """Whether loops bend the path, and agree with the poses between any other places too: a path that wrong ones have
-    folded, or bent from one mistaken place to the next, is small, and its places are near each other.
-    """
-    fit, chain = Fit(found.reduced, found.linear), found.linear.chain
-    chi2 = mahalanobis(*fit.left_out(fit.reduced.of_runs))[0]
-    if (chi2 > STUDENT_99[len(chain.axes)]).sum() <= BENT * len(chi2):
-        return False
-    loop, ends = decoys(chain, -(-CHANCES // len(chain.ends)))
-    anywhere = judge(replace(found.linear, chain=chain.with_loops(loop, ends)), None, EVEN, outliers)
-    return bool((anywhere.factor > 0).mean() > ANYWHERE)
+    def without(self, found: Inferred, chain: Chain, out: Bools) -> Inferred:
+        """The result without the loops `out (M,)`, whose motions are those of `chain`; trusted ones stay."""
+        trial = _Trial.of(chain, self, found.scales, EVEN)
+        linear = replace(found.linear, chain=trial.start.chain)
+        return trial.final(found.used & ~out | self.trusted, EVEN, linear, found.confirmed, found.of_places)
+
+    def refused(self, found: Inferred) -> Inferred:
+        """The result without unconfirmed loops: at the poses of the bare chain, and of the trusted loops."""
+        reduced = thinned(found.start.chain, np.flatnonzero(self.trusted))
+        return replace(found, used=self.trusted.copy(), linear=found.start, reduced=reduced, confirmed=False)
+
+    def is_crumpled(self, found: Inferred) -> bool:
+        """Whether loops bend the path, and agree with the poses between any other places too: a path that wrong ones
+        have folded, or bent from one mistaken place to the next, is small, and its places are near each other.
+        """
+        fit = Fit(found.reduced, found.linear)
+        chi2 = mahalanobis(*fit.left_out(fit.reduced.of_runs))[0]
+        if (chi2 > STUDENT_99[len(found.linear.chain.axes)]).sum() <= BENT * len(chi2):
+            return False
+        return bool((factors_by_chance(found.linear, self.outliers) > 0).mean() > ANYWHERE)
+
+    def _others_agree(self, found: Inferred, chain: Chain) -> bool:
+        """Whether by other errors, those of `chain`, other loops than the used ones agree with the poses found."""
+        linear = replace(found.linear, chain=chain)
+        judged = judge(linear, Fit(found.reduced, linear), EVEN, self.outliers)
+        return bool(((_agreeing(judged) | self.trusted) != found.used).any())
 
 
 BENT, ANYWHERE = 0.02, 0.6
@@ -141,15 +161,6 @@ and used, in three graphs of the literature and seven simulated ones. Right ones
 graphs of the literature with as many wrong ones, .45 in MIT, whose odometry is off by 84 m; .72, with .01 of the runs
 bent, where it turns wrongly by 6° a step.
 """
-
-
-def _others_agree(found: Inferred, chain: Chain, outliers: OutlierModel, trusted: Bools) -> bool:
-    """Whether by other errors, those of `chain`, other loops than the used ones agree with the poses found; `trusted`
-    (M,) are used in any case.
-    """
-    linear = replace(found.linear, chain=chain)
-    judged = judge(linear, Fit(found.reduced, linear), EVEN, outliers)
-    return bool(((_agreeing(judged) | trusted) != found.used).any())
 
 
 MOST_ANEW = 3
@@ -177,24 +188,22 @@ class _Rated:
 
 @dataclass(frozen=True)
 class _Trial:
-    """The inputs of `infer`: the bare chain, its loops judged `alone`, prior shares (2,) of right and wrong ones."""
+    """The inputs of `infer`: the bare chain, its loops judged `alone`, prior shares (2,) of right and wrong ones, and
+    what `by` judges them.
+    """
 
     start: Linear
     alone: Judged
     shares: Floats
-    outliers: OutlierModel
-    trusted: Bools
-    may_thin: bool
+    by: LoopJudge
     scales: Scales
 
     @classmethod
-    def of(
-        cls, chain: Chain, outliers: OutlierModel, trusted: Bools, may_thin: bool, scales: Scales, shares: Floats
-    ) -> _Trial:
+    def of(cls, chain: Chain, by: LoopJudge, scales: Scales, shares: Floats) -> _Trial:
         """The trial of a chain whose errors have these scales."""
         chain = scales.applied(chain)
         start = linearise(chain, chain.poses)
-        return cls(start, judge(start, None, shares, outliers), shares, outliers, trusted, may_thin, scales)
+        return cls(start, judge(start, None, shares, by.outliers), shares, by, scales)
 
     def found(self) -> Inferred | None:
         """What is `inferred`, or that nothing is used where nothing can be computed; None as in `infer`."""
@@ -203,8 +212,10 @@ class _Trial:
         except _TooManyLoops:
             return None
         except np.linalg.LinAlgError:  # loops tear paths so far apart that covariances are lost in rounding
-            reduced = thinned(self.start.chain, np.flatnonzero(self.trusted))
-            return Inferred(self.trusted, self.alone, self.scales, self.start, self.start, reduced, 0.0, False, -np.inf)
+            reduced = thinned(self.start.chain, np.flatnonzero(self.by.trusted))
+            return Inferred(
+                self.by.trusted, self.alone, self.scales, self.start, self.start, reduced, 0.0, False, -np.inf
+            )
 
     def inferred(self) -> Inferred:
         """The loops judged at the poses of the right ones. Where many that stand out on the bare chain are not used in
@@ -224,7 +235,7 @@ class _Trial:
     @property
     def standing_out(self) -> Bools:
         """Loops (M,) that the bare chain alone makes likely, and the trusted ones."""
-        return np.asarray(self.alone.factor > np.log(max(len(self.trusted), 1))) | self.trusted
+        return np.asarray(self.alone.factor > np.log(max(len(self.by.trusted), 1))) | self.by.trusted
 
     def halves_grown(self, rows: Ints) -> tuple[Bools, Linear, Floats]:
         """Which of the loops `rows (K,)` are used (M,) where in each round the stronger half of those that stand out is
@@ -232,24 +243,24 @@ class _Trial:
         """
         chain = self.start.chain
         start = replace(self.start, chain=chain.with_loops(rows, chain.ends[rows]))
-        some = replace(self, start=start, alone=self.alone.select(rows), trusted=self.trusted[rows])
-        begin = _stronger_half(some.alone.factor, np.ones(len(rows), bool)) | some.trusted
+        some = replace(self, start=start, alone=self.alone.select(rows), by=self.by.select(rows))
+        begin = _stronger_half(some.alone.factor, np.ones(len(rows), bool)) | some.by.trusted
         some_used, rated = some.grown(begin, some.start, self.shares, _stronger_half)
-        used = np.zeros_like(self.trusted)
+        used = np.zeros_like(self.by.trusted)
         used[rows] = some_used
         return used, replace(rated.linear, chain=chain), rated.shares
 
     def settled(self, used: Bools, rated: _Rated) -> Inferred:
         """The loops that agree from these on (M,), of places that are right together."""
         shares, linear = rated.shares, rated.linear
-        start, chain, trusted = self.start, self.start.chain, self.trusted
+        start, chain, trusted = self.start, self.start.chain, self.by.trusted
         fold = int(chain.broken.sum()) * float(np.log(chain.size))  # for the choice of the broken steps among all
         for _ in range(MOST_ANEW):
             agreed, judged, linear = self.agreed(used | trusted, shares, linear)
             before, used, confirmed, of_places = used, agreed, False, -np.inf
             if not agreed.any() or (judged.factor[agreed] - np.log(agreed.sum())).sum() <= by_chance(int(agreed.sum())):
                 break
-            places = Places.of(start, self.alone, agreed, self.outliers)
+            places = Places.of(start, self.alone, agreed, self.by.outliers)
             best = places.best(linear)
             of_places = best.of_all - fold
             confirmed = of_places > MISTAKEN and places.chance(best.right) + fold < -BY_CHANCE
@@ -261,10 +272,10 @@ class _Trial:
 
     def final(self, used: Bools, shares: Floats, linear: Linear, confirmed: bool, of_places: float) -> Inferred:
         """All loops judged at the poses of the used ones (M,), of which those that remain likely are used."""
-        start, chain, trusted = self.start, self.start.chain, self.trusted
+        start, chain, trusted = self.start, self.start.chain, self.by.trusted
         reduced = thinned(chain, np.flatnonzero(used))
-        fit = optimised(Fit(reduced, linear), MOST_STEPS)
-        judged = judge(fit.linear, fit, shares, self.outliers)
+        fit = optimised(Fit(reduced, linear))
+        judged = judge(fit.linear, fit, shares, self.by.outliers)
         shares, top = mixture(judged.factor)
         used = used & ((judged.log_odds > 0) | trusted)
         if np.log(shares[0] / shares[1]) < MISTAKEN:
@@ -287,10 +298,10 @@ class _Trial:
         wrong ones over many steps stand out until strong ones have told where these lead. By halves, a mistaken place
         among the strongest may be followed, which the others would outvote.
         """
-        limit = 0.5 * np.log(max(len(self.trusted), 1))
+        limit = 0.5 * np.log(max(len(self.by.trusted), 1))
         rated, together = self.rated(used, linear, shares), np.zeros_like(used)
-        for number in range(MOST_GROWN):
-            before, kept = used, (used & (rated.score > 0)) | self.trusted
+        for number in range(MOST_ROUNDS):
+            before, kept = used, (used & (rated.score > 0)) | self.by.trusted
             used = kept | chosen(rated.score, (rated.score > limit) & ~kept)
             if number and used.sum() <= before.sum():
                 together = self.likely_together(rated, ~used & ~together)
@@ -321,15 +332,15 @@ class _Trial:
         """All loops at the poses of one used loop (M,) of each place, optimised from `linear`."""
         rows, ends = np.flatnonzero(used), self.start.chain.places
         rows = rows[one_of_each_place(ends[rows])] if len(rows) else rows
-        fit = optimised(Fit(self.reduced(rows), linear), MOST_STEPS)
-        judged = judge(fit.linear, fit, shares, self.outliers)
+        fit = optimised(Fit(self.reduced(rows), linear))
+        judged = judge(fit.linear, fit, shares, self.by.outliers)
         shares, _ = mixture(judged.factor)
         return _Rated(judged, shares, fit.linear)
 
     def reduced(self, rows: Ints) -> Reduced:
         """The graph of these loops, of all where it may not be thinned."""
         reduced = thinned(self.start.chain, rows)
-        if not self.may_thin and len(reduced.active) < len(rows):
+        if not self.by.may_thin and len(reduced.active) < len(rows):
             raise _TooManyLoops
         return reduced
 
@@ -341,19 +352,19 @@ class _Trial:
         best, top, seen = (self.alone, start), -np.inf, b""
         for number in range(ROUNDS):
             reduced = self.reduced(np.flatnonzero(used))
-            fit = optimised(Fit(reduced, linear), MOST_STEPS)
+            fit = optimised(Fit(reduced, linear))
             if not number and fit.cost > len(reduced.active) * len(chain.axes):
                 # more than right loops should leave: the descent may have ended in a local minimum
-                other = optimised(Fit(reduced, from_rotations(Fit(reduced, start), MOST_STEPS)), MOST_STEPS)
+                other = optimised(Fit(reduced, from_rotations(Fit(reduced, start))))
                 fit = min(fit, other, key=lambda each: each.cost)
             linear = fit.linear
-            judged = judge(linear, fit, shares, self.outliers)
+            judged = judge(linear, fit, shares, self.by.outliers)
             shares, likelihood = mixture(judged.factor)
             if likelihood < top - BY_CHANCE:  # wrong loops bend the poses, more in each round
                 break
             if likelihood > top:
                 best, top = (judged, linear), likelihood
-            used = (judged.log_odds > 0) & (judged.factor > 0) | self.trusted
+            used = (judged.log_odds > 0) & (judged.factor > 0) | self.by.trusted
             if np.packbits(used).tobytes() == seen:
                 break
             seen = np.packbits(used).tobytes()
@@ -372,16 +383,6 @@ def _single_joins(chain: Chain, used: Bools) -> Bools:
     rows = np.flatnonzero(used & np.not_equal(*path[chain.ends].T))
     lone[rows] = series_classes(path[chain.ends[rows]], int(path[-1]) + 1) < 0
     return lone
-
-
-MOST_GROWN = 30
-"""Rounds in which loops are added: a limit on cost."""
-
-
-def refused(found: Inferred, trusted: Bools) -> Inferred:
-    """The result without unconfirmed loops: at the poses of the bare chain, and of the trusted loops (M,)."""
-    reduced = thinned(found.start.chain, np.flatnonzero(trusted))
-    return replace(found, used=trusted.copy(), linear=found.start, reduced=reduced, confirmed=False)
 
 
 BY_CHANCE_EACH_FOLD = 3.0

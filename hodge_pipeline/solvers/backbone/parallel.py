@@ -9,7 +9,8 @@ import numpy as np
 from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import has_unit_information, in_vertex_order, tail_gate
 from hodge_pipeline.solvers.backbone.credible import free_axes
-from hodge_pipeline.solvers.backbone.evidence import FEWEST, mahalanobis
+from hodge_pipeline.solvers.backbone.evidence import mahalanobis
+from hodge_pipeline.solvers.backbone.levels import FEWEST
 from hodge_pipeline.solvers.backbone.step_tests import closes, gate_of
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 

@@ -7,16 +7,17 @@ solution, whose χ² counts how far the steps bend.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import gammaln, pdtrc
 
 from hodge_pipeline.solvers.backbone.evidence import EVEN, OutlierModel, log_student, student_log_density
-from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, optimised, thinned
+from hodge_pipeline.solvers.backbone.fit import Fit, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, by_path, judge
-from hodge_pipeline.solvers.backbone.linear import Linear, linearise
+from hodge_pipeline.solvers.backbone.levels import MOST_TRIED, RANDOM
+from hodge_pipeline.solvers.backbone.linear import Linear
 from hodge_pipeline.solvers.backbone.loop_places import corridors, loops_at_place, one_of_each_place
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.scales import decoys
@@ -28,8 +29,6 @@ MISTAKEN_PLACES = 0.2
 """Expected number of mistaken places to a right one, beside the rivals that are not used. With more, a path that closes
 once would stay open: its loops can show little more than that the drift is as stated.
 """
-MOST_TRIED = 3
-"""Places left out on trial each time: a limit on cost."""
 MISTAKEN = float(np.log(20.0))
 """Log-odds of right places against mistaken ones that are enough, and that a change must gain."""
 FEW_ALIKE = 0.1
@@ -39,8 +38,6 @@ corridors: counted too, a few random loops kept 9 of 180 short rings at their od
 """
 PAIRED = 2
 """Loops of one place that agree by chance at the most: three among thousands are rare."""
-CHANCES = 4000
-"""Fewest random loops for the distribution of Bayes factors by chance."""
 MOST_PAIRS = 200_000
 """Pairs of loops that are compared: a limit on memory and time. All of 6000 at a few places took 2 GB and 22 CPU s."""
 
@@ -118,9 +115,7 @@ class Places:
         """
         if self.size[right].max() > PAIRED:
             return -np.inf
-        chain = self.start.chain
-        loop, ends = decoys(chain, -(-CHANCES // len(chain.ends)))
-        others = judge(linearise(chain.with_loops(loop, ends), self.start.poses), None, EVEN, self.outliers).factor
+        others = factors_by_chance(self.start, self.outliers)
         strongest = np.flatnonzero(right)[np.argsort(-self.bare[right], kind="stable")]
         stronger = len(others) - np.searchsorted(np.sort(others), self.bare[strongest]) + 0.5
         sizes = np.sort(np.concatenate([self.size, self.unused]))
@@ -130,7 +125,7 @@ class Places:
 
     def arranged(self, right: Bools, linear: Linear) -> Arrangement:
         """The arrangement of these places (K,), optimised from the poses of `linear`."""
-        fit = optimised(Fit(thinned(self.start.chain, self.loop[right]), linear), MOST_STEPS)
+        fit = optimised(Fit(thinned(self.start.chain, self.loop[right]), linear))
         active = np.searchsorted(self.loop, fit.reduced.active)
         # without rivals MISTAKEN_PLACES counts once, not for each place
         prior = max(len(active) - 1, 0) * float(np.log(MISTAKEN_PLACES)) - float(self.rivals(right)[active].sum())
@@ -174,6 +169,13 @@ class Places:
         bent = np.argsort(-chi2, kind="stable")
         doubtful = active[bent[(log_odds + np.log(MISTAKEN_PLACES))[bent] < 0][:MOST_TRIED]]
         return [found.right & (np.arange(len(self.loop)) != place) for place in doubtful]
+
+
+def factors_by_chance(linear: Linear, outliers: OutlierModel) -> Floats:
+    """Log Bayes factors (K,) that the motions of loops have between random places of a chain, along its path."""
+    chain = linear.chain
+    loop, ends = decoys(chain, -(-RANDOM // len(chain.ends)))
+    return judge(replace(linear, chain=chain.with_loops(loop, ends)), None, EVEN, outliers).factor
 
 
 def agreeing_groups(pairwise: PairwiseConsistency, rows: Ints) -> list[Ints]:

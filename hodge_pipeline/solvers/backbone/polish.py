@@ -23,7 +23,9 @@ CROWDED_POWER = 0.5
 error in all.
 """
 ROUNDS, STEPS = 5, 3
-"""Reweighting rounds, and Gauss–Newton steps in each: limits on cost."""
+"""Reweighting rounds, and Gauss–Newton steps in each. With 15 rounds MIT's graph ends at 2.49 m for 1.80, manhattan's
+at .50 for .47.
+"""
 
 
 def polished(reduced: Reduced, linear: Linear) -> tuple[Linear, Floats]:

@@ -14,7 +14,6 @@ from hodge_pipeline.solvers.backbone.credible import MOST_OF_A_STEP
 from hodge_pipeline.solvers.backbone.evidence import (
     BY_CHANCE,
     EVEN,
-    FEWEST,
     OutlierModel,
     OutlierResiduals,
     mahalanobis,
@@ -22,6 +21,7 @@ from hodge_pipeline.solvers.backbone.evidence import (
     student_log_density,
 )
 from hodge_pipeline.solvers.backbone.fit import Fit
+from hodge_pipeline.solvers.backbone.levels import FEWEST, MOST_TRIED
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.types import Floats, Ints
@@ -41,9 +41,9 @@ SMALLER = np.log(4.0) * np.array([0, -1, -2])
 """Logarithms of common scales; another search begins at the likeliest. By stated errors far too large right loops say
 no more than chance does, and no change of one scale alone makes them likelier.
 """
-UNITS, TRIED = np.log(4.0) * np.array([-8, -7, -6, -5, -4, -3, -2, 2, 3, 4, 5, 6, 7, 8]), 3
-"""Further starts of the search, logarithms of a common scale, and how many of these, the likeliest, are searched. From
-them the scales of rotation and translation are independent where the information is the identity, for unknown.
+UNITS = np.log(4.0) * np.array([-8, -7, -6, -5, -4, -3, -2, 2, 3, 4, 5, 6, 7, 8])
+"""Further starts of the search, logarithms of a common scale, of which the likeliest are searched. From them the scales
+of rotation and translation are independent where the information is the identity, for unknown.
 """
 FARTHEST = 3 * np.log(4.0)
 """Least distance of further starts from the stated scale: nearer ones would explain mistaken places."""
@@ -168,7 +168,7 @@ def learned_scales(chain: Chain, outliers: OutlierModel) -> Iterator[tuple[Scale
     found = _likeliest(value, 0.0)
     units = UNITS[np.abs(UNITS) >= FARTHEST] if chain.stated else UNITS
     values = np.array([value(np.full(4, unit), unit) for unit in units])
-    tried = np.argsort(-values, kind="stable")[:TRIED]
+    tried = np.argsort(-values, kind="stable")[:MOST_TRIED]
     tried = tried[values[tried] > found[1]] if chain.stated else tried
     others = [_likeliest(value, unit) for unit in units[tried].tolist()]
     other = max(others, key=lambda each: each[1], default=found)

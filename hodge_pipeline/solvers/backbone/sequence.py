@@ -6,10 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from hodge_pipeline.solvers.backbone.levels import NEARLY_ALL
 from hodge_pipeline.types import Bools, Ints, ViewGraph
-
-COVERED = 0.9
-"""Share of the number of vertices that consecutive edges must reach, so that a sequence is a backbone."""
 
 
 def consecutive_edges(graph: ViewGraph) -> Bools:
@@ -41,7 +39,7 @@ def numbered_along_path(graph: ViewGraph) -> ViewGraph:
     graph, each new vertex is reached from the last one of its path, by whatever ids.
     """
     count = graph.vertex_count
-    if sequential_edges(graph).sum() >= COVERED * count:
+    if sequential_edges(graph).sum() >= NEARLY_ALL * count:
         return graph
     path, paths = [-1] * count, list[list[int]]()
     for a, b in graph.edges.tolist():
@@ -60,7 +58,7 @@ def numbered_along_path(graph: ViewGraph) -> ViewGraph:
         else:
             path[new] = path[old]
             along.append(new)
-    if sum(map(len, paths)) - len(paths) < COVERED * count:
+    if sum(map(len, paths)) - len(paths) < NEARLY_ALL * count:
         return graph
     numbers = np.empty(count, np.int64)
     order = [vertex for each in paths for vertex in each] + [row for row in range(count) if path[row] < 0]

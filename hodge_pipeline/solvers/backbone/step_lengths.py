@@ -11,7 +11,8 @@ import numpy as np
 
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE
-from hodge_pipeline.solvers.backbone.fit import MOST_STEPS, Fit, optimised, thinned
+from hodge_pipeline.solvers.backbone.fit import Fit, optimised, thinned
+from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS, SIGMAS
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -23,14 +24,10 @@ TOLD = 0.1
 Bicocca's, make a path the likelier the shorter it is: its factor is 1.5 to 2.3, to .19 to .5, those of ten others of
 the literature to .004 to .1, of 100 simulated ones to .09 but for a few.
 """
-AGREE = 3.0
-"""Standard deviations by which all loops together may tell another factor. Where loops or their errors are mistaken
-they tell one that differs by 3.5 to 6.
-"""
 SPREAD = 0.5
 """Prior standard deviation of a factor, for one that loops do not tell."""
-ROUNDS, SETTLED = 5, 1e-3
-"""Refits of a factor: a limit on cost; and the change of its logarithm that ends them."""
+SETTLED = 1e-3
+"""Change of the logarithm of a factor that ends its refits."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +44,8 @@ def misstated_lengths(fitted: Chain, poses: Floats, used: Ints) -> list[StepLeng
     (n, 4, 4)`: solved ones.
 
     A factor has to make the residuals of one loop of each place smaller than chance does, by whatever errors: those
-    that were learned with a wrong length explain it. All loops together have to tell the same factor.
+    that were learned with a wrong length explain it. All loops together have to tell the same factor, within
+    `SIGMAS` of its standard deviations: where loops or their errors are mistaken they tell one that is 3.5 to 6 off.
     """
     measured = fitted.inner & ~fitted.bridged
     path = np.cumsum(fitted.step_edge < 0) - 1
@@ -58,7 +56,7 @@ def misstated_lengths(fitted: Chain, poses: Floats, used: Ints) -> list[StepLeng
     places = thinned(fitted, used[one_of_each_place(fitted.places[used])])
     freedom = len(fitted.axes) * (len(places.active) - len(np.unique(path[fitted.ends[places.active]])) + 1)
     found: list[StepLength] = []
-    fit = optimised(Fit(places, linearise(fitted, poses)), MOST_STEPS)
+    fit = optimised(Fit(places, linearise(fitted, poses)))
     while freedom > len(groups) and len(found) < len(alone):
         best = max(groups, key=lambda of: _gain(fit, of))
         other, factor = _refitted(fit, best)
@@ -69,7 +67,7 @@ def misstated_lengths(fitted: Chain, poses: Floats, used: Ints) -> list[StepLeng
         if sigma > TOLD:
             break
         _, more = _refitted(Fit(thinned(fitted, used), other.linear), best)
-        if abs(np.log(more)) > AGREE * sigma:
+        if abs(np.log(more)) > SIGMAS * sigma:
             break
         found.append(StepLength(best, factor * more, best is measured))
         fit = other
@@ -79,14 +77,14 @@ def misstated_lengths(fitted: Chain, poses: Floats, used: Ints) -> list[StepLeng
 def _refitted(fit: Fit, of: Bools) -> tuple[Fit, float]:
     """The fit with the likeliest length of the steps `of (n,)`, and by how many times they were too long."""
     log_length = 0.0
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROUNDS):
         slope, curvature = _score(fit, of)
         change = (slope - log_length / SPREAD**2) / (curvature + 1 / SPREAD**2)
         log_length += (change := float(np.clip(change, -SPREAD, SPREAD)))
         chain, step = fit.linear.chain, fit.linear.chain.step.copy()
         step[of, :3, 3] *= np.exp(change)
         linear = linearise(replace(chain, step=step), fit.linear.poses)
-        fit = optimised(replace(fit, linear=linear), MOST_STEPS)
+        fit = optimised(replace(fit, linear=linear))
         if abs(change) < SETTLED:
             break
     return fit, float(np.exp(-log_length))

@@ -9,12 +9,13 @@ import numpy as np
 from hodge_pipeline.complex.chi2 import tail_weight
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis
+from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS
 from hodge_pipeline.types import Floats
 
 TAIL = 0.1
 """Share of the most unusual steps, to which the tail of the sizes is fitted (Hill 1975)."""
-ROUNDS, LEAST = 10, 1e-6
-"""Reweighting rounds of `StepModel`, and the share of each variance that is added to it."""
+LEAST = 1e-6
+"""Share of each variance that is added to it."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class StepModel:
 def _student_covariance(left: Floats) -> tuple[Floats, Floats]:
     """The covariance (p, p) of residuals (M, p), with weights by Student's t, and their χ² (M,)."""
     weight = np.ones(len(left))
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROUNDS):
         covariance = (left * weight[:, None]).T @ left / len(left)
         covariance += np.diag(LEAST * np.diag(covariance) + np.finfo(float).tiny ** 0.5)
         chi2 = mahalanobis(left, np.broadcast_to(covariance, (len(left), *covariance.shape)))[0]

@@ -19,13 +19,13 @@ from hodge_pipeline.solvers.backbone.chain import Chain, make_chain
 from hodge_pipeline.solvers.backbone.credible import credible_steps
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE
 from hodge_pipeline.solvers.backbone.inference import Inferred
+from hodge_pipeline.solvers.backbone.levels import FEWEST, NEARLY_ALL, TOLERANCE
 from hodge_pipeline.solvers.backbone.linear import Linear, inverse
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.mistakes import shared_shift
 from hodge_pipeline.solvers.backbone.parallel import Fused, fused, loops_once
 from hodge_pipeline.solvers.backbone.polish import LOCAL
 from hodge_pipeline.solvers.backbone.sequence import (
-    COVERED,
     consecutive_edges,
     linear_forest,
     numbered_along_path,
@@ -41,9 +41,9 @@ from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 from hodge_pipeline.types.text import counted
 
 AUTO, SEQUENTIAL, NONE = "auto", "sequential", "none"
-FEWEST_STEPS, MOST_PATHS = 10, 10
-"""Of a backbone that `auto` looks for: its paths have on average at least this many steps times the number of paths, up
-to this many, since loops must join them: one path 10 steps, ten paths or more 100 each.
+MOST_PATHS = 10
+"""Paths of a backbone that `auto` looks for have on average at least `FEWEST` steps times their number, up to this
+many, since loops must join them: one path 10 steps, ten paths or more 100 each.
 """
 AGREEING_REFUSED = 0.05
 """Loops per step that the backbone refuses though they agree with each other, beyond which the backbone is in doubt,
@@ -238,7 +238,7 @@ def _of_single_steps(
     """The backbone of a graph, judged on its fused graph with one edge for each step: see `find_backbone`."""
     graph = single.graph
     chosen = sequential_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
-    if trust == AUTO and chosen.sum() < max(FEWEST_STEPS, COVERED * graph.vertex_count):
+    if trust == AUTO and chosen.sum() < max(FEWEST, NEARLY_ALL * graph.vertex_count):
         return None
     if not chosen.any():
         raise GraphError("no edge joins consecutive vertices, so that there is no sequence to trust: use --trust none")
@@ -247,7 +247,7 @@ def _of_single_steps(
     if not len(chain.loop_edge):
         return None
     paths = len(np.unique(chain.path[chain.step_edge >= 0]))
-    if trust == AUTO and steps.sum() < FEWEST_STEPS * min(paths, MOST_PATHS) * paths:
+    if trust == AUTO and steps.sum() < FEWEST * min(paths, MOST_PATHS) * paths:
         return None
     many_loops = trust == AUTO and len(chain.loop_edge) > LOOPS_AT_A_STEP * steps.sum()
     if in_lattice and not many_loops or not in_lattice and many_loops and is_tested(chain):
@@ -365,7 +365,7 @@ def of_every_loop(graph: ViewGraph, backbone: Backbone, trusted: Bools) -> Backb
     return replace(backbone, used=used, right=right, world_from_cam=poses)
 
 
-MOST_SOLVED, TOLERANCE = 5, 1e-4
-"""Reweighted solves, each in seconds for 100,000 edges; and the relative tolerance of χ²."""
+MOST_SOLVED = 5
+"""Reweighted solves, each in seconds for 100,000 edges."""
 UNUSED = 0.49
 """Largest probability that is reported of an unused loop."""

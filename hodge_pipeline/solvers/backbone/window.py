@@ -18,6 +18,7 @@ from hodge_pipeline.complex.chi2 import (
 from hodge_pipeline.solvers.backbone.chain import STEPS_OF_PLACE, Chain, make_chain
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis
 from hodge_pipeline.solvers.backbone.judge import by_path
+from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS, NEARLY_ALL, TOLERANCE
 from hodge_pipeline.solvers.backbone.linear import inverse, linearise
 from hodge_pipeline.solvers.backbone.parallel import Fused
 from hodge_pipeline.solvers.backbone.sequence import sequential_edges, steps_apart
@@ -34,23 +35,18 @@ from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.reweighted import SETTLED
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
-AGREEING = 0.9
-"""Share of those edges that must agree with each other and the steps. Of edges between fragments of rooms, every pair
-of which was tried, .69 to .84 do, of the cubicle's .6; of graphs whose odometry has a window nearly all.
-"""
-ROUNDS = 10
-"""Reweighted solves: a limit on cost."""
 WRITTEN, TURNED_RAD = 5e-6, 10.0
 """Largest rounding error, as a share of the number, where six digits are written, as streams of C++ do; and an angle
 that was not taken back to half a turn.
 """
-TOLERANCE, LEAST = 1e-4, 1e-9
-"""Relative tolerance of χ² of each solve, and the least weight of an edge, so that the graph stays connected."""
+LEAST = 1e-9
+"""Least weight of an edge, so that the graph stays connected."""
 
 
 def windowed(given: Fused) -> Fused:
     """The graph whose edges over a few steps are fused into the steps, if they are many and nearly all agree; else the
-    same. A step that they contradict is replaced by what they imply.
+    same. A step that they contradict is replaced by what they imply. Of edges between fragments of rooms, every pair of
+    which was tried, .6 to .84 agree.
     """
     graph = given.graph
     steps, apart = sequential_edges(graph), steps_apart(graph)
@@ -69,7 +65,7 @@ def windowed(given: Fused) -> Fused:
     weights, poses = _agreeing(learned, near, fits, scale, doubted)
     (of_step, of_near), agree = np.split(weights, [len(at)]), weights[len(at) :] > 0
     good = near[agree]
-    if len(good) < AGREEING * len(near) or not _many(chain, good):
+    if len(good) < NEARLY_ALL * len(near) or not _many(chain, good):
         return given
     replaced = (of_step == 0) & (chain.over(chain.ends[good]) > 0)[at]
     contradicted = np.concatenate([chain.step_edge[at[replaced]], chain.loop_edge[near[~agree]]])
@@ -207,7 +203,7 @@ def _agreeing(chain: Chain, near: Ints, fits: Bools, scale: float, doubted: Bool
         return solve(weighted, start=start, initial="given", relative_tolerance=TOLERANCE).world_from_cam
 
     poses = solved(weights, chain.poses)
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROUNDS):
         chi2 = chi2_by_information(graph, poses) / scale
         before, weights = weights, np.minimum(tail_weight(chi2, size), 1.0)
         if np.abs(weights - before).max() < SETTLED:
