@@ -75,9 +75,11 @@ def infer_bridged(
     second = by.infer(unbiased)
     if second is None:
         return found
-    other = judged(unbiased, second)
-    least = found[1].of_places + BY_CHANCE * len(unbiased.bias) if found[1].confirmed else -np.inf
-    return other if other[1].confirmed and other[1].of_places > least else found
+    (apart, other), (chain, before) = judged(unbiased, second), found
+    likelier = other.of_places > before.of_places + BY_CHANCE * len(unbiased.bias)
+    if apart.broken.sum() > chain.broken.sum():  # breaks may only mend what the wrong bias did
+        likelier = likelier and other.log_evidence > before.log_evidence
+    return (apart, other) if other.confirmed and (likelier or not before.confirmed) else found
 
 
 def _bridged(unbroken: Chain, first: Inferred, by: LoopJudge, most: int) -> tuple[Chain, Inferred]:

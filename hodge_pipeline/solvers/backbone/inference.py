@@ -12,10 +12,9 @@ from scipy.special import expit
 from hodge_pipeline.complex.chi2 import STUDENT_99
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.solvers.backbone.chain import Chain
-from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, EVEN, OutlierModel, mahalanobis, mixture
+from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, EVEN, OutlierModel, log_student, mahalanobis, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, from_rotations, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, densities, judge
-from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.mistakes import Mistake, mistakes
@@ -300,7 +299,7 @@ class _Trial:
         """
         limit = 0.5 * np.log(max(len(self.by.trusted), 1))
         rated, together = self.rated(used, linear, shares), np.zeros_like(used)
-        for number in range(MOST_ROUNDS):
+        for number in range(MOST_GROWN):
             before, kept = used, (used & (rated.score > 0)) | self.by.trusted
             used = kept | chosen(rated.score, (rated.score > limit) & ~kept)
             if number and used.sum() <= before.sum():
@@ -308,24 +307,25 @@ class _Trial:
                 if not together.any():
                     break
                 used = used | together
+                far = from_rotations(Fit(self.reduced(np.flatnonzero(used)), self.start))
+                rated = replace(rated, linear=far)
             rated = self.rated(used, rated.linear, rated.shares)
         return used, rated
 
     def likely_together(self, rated: _Rated, among: Bools) -> Bools:
-        """Of the loops `among (M,)`, each of which the path may lead to but does not make likely, those that agree
-        with one of them, where these are more places than agree by chance.
+        """Of the loops `among (M,)` those that agree with one of them, in more places than by chance, where each fits
+        the path and none could stand out alone if it fitted better: after a long way nearly any loop fits.
         """
-        rows = np.flatnonzero(among & (rated.judged.chi2 <= STUDENT_99[len(self.start.chain.axes)]))
+        judged, size = rated.judged, len(self.start.chain.axes)
+        could = judged.factor + log_student(0.0, size) - log_student(judged.chi2, size)
+        alone = float(np.log(len(among)))
+        rows = np.flatnonzero(among & (judged.chi2 <= STUDENT_99[size]) & (could <= alone))
         found = np.zeros_like(among)
-        if len(rows) < 2:
-            return found
-        pairwise = PairwiseConsistency(rated.linear, rated.judged.factor, rated.judged.log_wrong, ~among)
-        least = BY_CHANCE + float(np.log(len(among)))
-        for seed, factor in pairwise.seeds(rows):
-            gain = float(pairwise.gains(seed, rows, factor).sum())
-            if gain > least:
+        pairwise = PairwiseConsistency(rated.linear, judged.factor, judged.log_wrong, ~among)
+        for seed, factor in pairwise.seeds(rows) if len(rows) else ():
+            if pairwise.gains(seed, rows, factor).sum() > BY_CHANCE + alone:
                 found[rows[factor > 0]] = found[seed] = True
-                return found
+                break
         return found
 
     def rated(self, used: Bools, linear: Linear, shares: Floats) -> _Rated:
@@ -385,6 +385,8 @@ def _single_joins(chain: Chain, used: Bools) -> Bools:
     return lone
 
 
+MOST_GROWN = 30
+"""Rounds in which loops are added: a limit on cost."""
 BY_CHANCE_EACH_FOLD = 3.0
 """Increase of the log-evidence that chance reaches with each e-fold of loops, measured with random loops in simulated
 graphs and in those of Bicocca and RobotCar, whose best reach half of it.
