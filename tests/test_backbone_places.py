@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from backbone_graphs import Drive, at_one_place, drive, field, two_laps, with_weak_steps
+from backbone_graphs import Drive, at_one_place, drive, field, round_trip, two_laps, with_weak_steps
 from benchmarks.spoilt_graphs import mistaken_cases
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.refine.pose_graph import read_graph
@@ -227,3 +227,11 @@ def test_a_loop_of_a_right_place_that_the_poses_contradict_does_not_count(monkey
     backbone = find_backbone(made.graph)
     assert backbone is not None and backbone.used[loops].any()
     assert not backbone.used[~made.right].any()
+
+
+def test_loops_that_a_long_way_makes_no_likelier_singly_are_judged_together() -> None:
+    """After a circle whose heading errs by a radian nearly any loop fits, and none stood out: 62 m, as the odometry."""
+    made = with_weak_steps(round_trip(2, 100, dimension=2, wrong=100), 0.04, 2)
+    found = diagnose(made.graph)
+    np.testing.assert_array_equal(found.kept, made.right)
+    assert made.error_m(found.world_from_cam) < 0.1 * made.error_m(made.odometry())

@@ -12,13 +12,13 @@ from scipy.special import expit
 from hodge_pipeline.complex.chi2 import STUDENT_99
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.solvers.backbone.chain import Chain
-from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, EVEN, OutlierModel, log_student, mahalanobis, mixture
+from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, EVEN, OutlierModel, mahalanobis, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, from_rotations, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, densities, judge
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.mistakes import Mistake, mistakes
-from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
+from hodge_pipeline.solvers.backbone.pairwise import likely_together
 from hodge_pipeline.solvers.backbone.places import MISTAKEN, Places, factors_by_chance
 from hodge_pipeline.solvers.backbone.polish import polished
 from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
@@ -291,7 +291,7 @@ class _Trial:
         chosen: Callable[[Floats, Bools], Bools] = lambda score, among: among,
     ) -> tuple[Bools, _Rated]:
         """Loops (M,), and all loops at their poses, from those `used (M,)` on: in rounds those are added that stand out
-        at the new poses, or are `chosen` among these by their score (M,).
+        at the new poses, or are `chosen` among these by their score (M,); where none is left, those `likely_together`.
 
         Weak loops may be wrong in one way together and, taken all at once, bend the poses until right ones do not fit:
         wrong ones over many steps stand out until strong ones have told where these lead. By halves, a mistaken place
@@ -303,7 +303,7 @@ class _Trial:
             before, kept = used, (used & (rated.score > 0)) | self.by.trusted
             used = kept | chosen(rated.score, (rated.score > limit) & ~kept)
             if number and used.sum() <= before.sum():
-                together = self.likely_together(rated, ~used & ~together)
+                together = likely_together(rated.linear, rated.judged, ~used & ~together)
                 if not together.any():
                     break
                 used = used | together
@@ -311,22 +311,6 @@ class _Trial:
                 rated = replace(rated, linear=far)
             rated = self.rated(used, rated.linear, rated.shares)
         return used, rated
-
-    def likely_together(self, rated: _Rated, among: Bools) -> Bools:
-        """Of the loops `among (M,)` those that agree with one of them, in more places than by chance, where each fits
-        the path and none could stand out alone if it fitted better: after a long way nearly any loop fits.
-        """
-        judged, size = rated.judged, len(self.start.chain.axes)
-        could = judged.factor + log_student(0.0, size) - log_student(judged.chi2, size)
-        alone = float(np.log(len(among)))
-        rows = np.flatnonzero(among & (judged.chi2 <= STUDENT_99[size]) & (could <= alone))
-        found = np.zeros_like(among)
-        pairwise = PairwiseConsistency(rated.linear, judged.factor, judged.log_wrong, ~among)
-        for seed, factor in pairwise.seeds(rows) if len(rows) else ():
-            if pairwise.gains(seed, rows, factor).sum() > BY_CHANCE + alone:
-                found[rows[factor > 0]] = found[seed] = True
-                break
-        return found
 
     def rated(self, used: Bools, linear: Linear, shares: Floats) -> _Rated:
         """All loops at the poses of one used loop (M,) of each place, optimised from `linear`."""

@@ -9,8 +9,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
+from hodge_pipeline.complex.chi2 import STUDENT_99
 from hodge_pipeline.solvers.backbone.chain import Chain
-from hodge_pipeline.solvers.backbone.evidence import student_log_density
+from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, log_student, student_log_density
+from hodge_pipeline.solvers.backbone.judge import Judged
 from hodge_pipeline.solvers.backbone.linear import Linear, shifted, turned
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -127,3 +129,18 @@ class PairwiseConsistency:
                 gain[alike] /= loops_at_place(self.chain.places[rows[alike]])
         gain[np.abs(self.chain.places[rows] - self.chain.places[seed]).max(axis=1) < 1.0] = 0.0
         return np.asarray(np.where(self.used[rows], np.minimum(gain, 0.0), gain))
+
+
+def likely_together(linear: Linear, judged: Judged, among: Bools) -> Bools:
+    """Of the loops `among (M,)`, as they were judged, those that agree with one of them, in more places than by chance,
+    where each fits the path and none could stand out alone if it fitted better: after a long way nearly any loop fits.
+    """
+    size, alone = len(linear.chain.axes), float(np.log(len(among)))
+    could = judged.factor + log_student(0.0, size) - log_student(judged.chi2, size)
+    rows = np.flatnonzero(among & (judged.chi2 <= STUDENT_99[size]) & (could <= alone))
+    found, pairwise = np.zeros_like(among), PairwiseConsistency(linear, judged.factor, judged.log_wrong, ~among)
+    for seed, factor in pairwise.seeds(rows) if len(rows) else ():
+        if pairwise.gains(seed, rows, factor).sum() > BY_CHANCE + alone:
+            found[rows[factor > 0]] = found[seed] = True
+            break
+    return found
