@@ -13,7 +13,7 @@ from hodge_pipeline.complex.short_cycles import short_cycles
 from hodge_pipeline.diagnosis.cycles import Cycles, closing_support, judge_cycles, usual_share
 from hodge_pipeline.diagnosis.noise import Noise, edge_noise, recentred
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.solvers.backbone.levels import FEWEST, MOST_ROUNDS
+from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 FLOOR, CEILING = 0.05, 0.98
@@ -24,6 +24,10 @@ LEAST_ODDS = 2.0
 """Least odds ratio of neighbours against far pairs to be joined, or against all to be right, for the order to count."""
 DOUBTED = 2
 """Unjoined neighbours that are added to those counted: of few views all may be joined by chance."""
+FEW = 20
+"""Edges of a gap at which the usual share of right edges weighs as much as their own. With 10 the cubicle has one right
+edge more that is not kept.
+"""
 TRIED_FROM = 0.1
 """Share of far pairs that are joined, from which on all pairs are taken to have been tried."""
 CYCLES_PER_EDGE = 64
@@ -81,7 +85,7 @@ def right_by_gap(edges: Ints, vertex_count: int, cycles: Cycles, usual: float) -
         wrong = np.bincount(entry, ((1 - share)[entry] / (1 - close[row])), len(bounds))
         share = np.clip(1 - (wrong + 1 - usual) / (passes + 1), FLOOR, (number + 1) / (number + 2))
     # the estimate of a gap with few edges is poor: a doubtful edge would count against itself
-    trust = number / (number + FEWEST)
+    trust = number / (number + FEW)
     usual = float(np.clip(usual, FLOOR, CEILING))
     logit = trust * np.log(share / (1 - share)) + (1 - trust) * np.log(usual / (1 - usual))
     return np.asarray(expit(logit[place]))
