@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hodge_pipeline.complex.chi2 import MEDIAN_CHI2
+from hodge_pipeline.complex.chi2 import MEDIAN_CHI2, STUDENT_99
 from hodge_pipeline.solvers.backbone.bias import without_bias
 from hodge_pipeline.solvers.backbone.breaks import Break, Runs, agreed_breaks, unusual_breaks
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
-from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mixture
+from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mahalanobis, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, optimised
 from hodge_pipeline.solvers.backbone.inference import Inferred, LoopJudge, by_chance
 from hodge_pipeline.solvers.backbone.judge import densities
 from hodge_pipeline.solvers.backbone.levels import MOST_TRIED
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import loops_at_place
-from hodge_pipeline.solvers.backbone.mistakes import shared_shift, without_shift
+from hodge_pipeline.solvers.backbone.mistakes import SAME_SHIFT, shared_shift, without_shift
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.places import MISTAKEN, MISTAKEN_PLACES, agreeing_groups
 from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
@@ -199,10 +199,25 @@ def _better(chain: Chain, found: Inferred, as_stated: Inferred | None, by: LoopJ
         same = by.infer(tried, found.scales)  # so that nothing but the step differs
         if same is None or same.log_evidence <= found.log_evidence + least:
             continue
+        if not broken.usual and _as_far_as_a_mistake(chain, broken, same):
+            continue
         if broken.usual or same.start.chain.corridors_over(broken.at, np.flatnonzero(same.used)) > 1:
             again = by.infer(tried)
             return tried, same if again is None or again.log_evidence < same.log_evidence else again
     return None
+
+
+def _as_far_as_a_mistake(chain: Chain, broken: Break, found: Inferred) -> bool:
+    """Whether a step is bridged by a jump without a turn, about as far as a shift that loops share which are still
+    unused: some of those that take a place for one that looks alike, where the path leads from the one to the other.
+    """
+    split = chain.rotation_axes
+    jump = chain.log(chain.between(chain.step[[broken.at]], broken.motion[None]))
+    turned = mahalanobis(jump[:, :split], broken.covariance[None, :split, :split])[0][0] > STUDENT_99[split]
+    alike = [each.rows for each in found.mistakes() if each.is_shift and each.nats > BY_CHANCE] if not turned else []
+    shifts = [shared_shift(found.linear.chain, found.linear.poses, rows)[0] for rows in alike]
+    far = float(np.linalg.norm(jump[0, split:]))
+    return any(abs(float(np.linalg.norm(shift)) - far) < SAME_SHIFT * far for shift in shifts)
 
 
 def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
