@@ -284,3 +284,34 @@ def field(seed: int) -> Drive:
     motion = motion @ se3.exp(rng.normal(size=sigma.shape) * sigma)
     graph = ViewGraph.from_edges(position, edges, motion, np.eye(6) / sigma[:, None, :] ** 2, dimension=3)
     return Drive(graph, np.asarray(truth), np.arange(len(edges)) < right)
+
+
+def offices(seed: int, right: int, wrong: int) -> Drive:
+    """Six corridors of 40 m, 20 m apart, walked from end to end in any order, with loops between places seen again, and
+    wrong ones that take a corridor for the next one.
+    """
+    rng, places, row, is_far = np.random.default_rng(seed), list[tuple[float, float]](), 0, False
+    while len(places) < 1600:
+        along = np.arange(0, 40, 0.5)
+        places += [(40 - x if is_far else x, 20.0 * row) for x in along]
+        is_far, other = not is_far, int(np.clip(row + rng.choice([-1, 1]), 0, 5))
+        places += [(40.0 * is_far, y) for y in np.linspace(20 * row, 20 * other, 40, endpoint=False)]
+        row = other
+    xyz = np.column_stack([np.array(places[:1600]) + rng.normal(0, 0.1, (1600, 2)), np.zeros(1600)])
+    ahead = np.diff(xyz, axis=0, append=xyz[-1:])
+    truth = se3.from_parts(se3.so3_exp(np.outer(np.arctan2(ahead[:, 1], ahead[:, 0]), [0.0, 0.0, 1.0])), xyz)
+    moved, tree = np.tile(np.eye(4), (3, 1, 1)), cKDTree(xyz)
+    moved[1:, 1, 3] = 20.0, -20.0
+    edges, motions = [np.stack([np.arange(1599), np.arange(1, 1600)], axis=1)], [se3.inverse(truth[:-1]) @ truth[1:]]
+    for aside, count in zip(moved, (right, wrong // 2, wrong - wrong // 2), strict=True):
+        near = tree.query_ball_point(xyz + aside[:3, 3], 1.0)
+        pairs = np.array([(i, j) for i, others in enumerate(near) for j in others if abs(i - j) > 60])
+        pairs = pairs[rng.choice(len(pairs), count, replace=False)]
+        edges.append(pairs)
+        motions.append(se3.inverse(aside @ truth[pairs[:, 0]]) @ truth[pairs[:, 1]])
+    ends, exact = np.concatenate(edges), np.concatenate(motions)
+    size = np.where(np.arange(len(ends))[:, None] < 1599, [[0.003, 0.02]], [[0.01, 0.05]])
+    information = np.zeros((len(ends), 6, 6))
+    information[:, PLANAR_AXES, PLANAR_AXES] = 1 / np.repeat(size, 3, axis=1)[:, PLANAR_AXES] ** 2
+    graph = ViewGraph.from_edges(np.arange(1600), ends, exact @ se3.exp(_noise(rng, size, 2)), information, dimension=2)
+    return Drive(graph, truth, np.arange(len(ends)) < 1599 + right)
