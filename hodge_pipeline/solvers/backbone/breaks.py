@@ -8,7 +8,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import FREEDOM, STUDENT_99, tail_weight
-from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, mahalanobis, student_log_density
+from hodge_pipeline.solvers.backbone.evidence import mahalanobis, student_log_density
 from hodge_pipeline.solvers.backbone.fit import Fit
 from hodge_pipeline.solvers.backbone.levels import MOST_TRIED
 from hodge_pipeline.solvers.backbone.linear import linearise, turned
@@ -18,6 +18,10 @@ from hodge_pipeline.types import Bools, Floats, Ints
 
 PLATEAU = 12.0
 """Nats below the best step at which a step is no candidate for the break."""
+LEAST_COST = 4.0
+"""Nats that the residual of a run must cost before its steps are tested: a limit on time. With those of chance, 4.6, one
+of a hundred broken steps is missed.
+"""
 
 
 @dataclass(frozen=True)
@@ -152,11 +156,11 @@ class Runs:
         return out
 
     def likeliest_break(self) -> Break | None:
-        """The likeliest broken step of runs whose residual costs more than chance does; None without such a run.
+        """The likeliest broken step of runs whose residual costs more than `LEAST_COST`; None without such a run.
 
         Many loops on either side hide a break from each other, not from the run between them.
         """
-        costly = np.flatnonzero(self.cost > BY_CHANCE)
+        costly = np.flatnonzero(self.cost > LEAST_COST)
         if not len(costly):
             return None
         at = np.concatenate([np.arange(low + 1, high + 1) for low, high in self.pairwise.chain.ends[costly].tolist()])
