@@ -19,8 +19,8 @@ from hodge_pipeline.types import Bools, Floats, Ints
 PLATEAU = 12.0
 """Nats below the best step at which a step is no candidate for the break."""
 LEAST_COST = 4.0
-"""Nats that the residual of a run must cost before its steps are tested: a limit on time. With those of chance, 4.6, one
-of a hundred broken steps is missed.
+"""Nats that the residual of a run must cost before its steps are tested: a limit on time. With those of chance, 4.6,
+one of a hundred broken steps is missed.
 """
 
 
