@@ -13,7 +13,6 @@ from hodge_pipeline.complex.short_cycles import short_cycles
 from hodge_pipeline.diagnosis.cycles import Cycles, closing_support, judge_cycles, usual_share
 from hodge_pipeline.diagnosis.noise import Noise, edge_noise, recentred
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 FLOOR, CEILING = 0.05, 0.98
@@ -24,6 +23,8 @@ LEAST_ODDS = 2.0
 """Least odds ratio of neighbours against far pairs to be joined, or against all to be right, for the order to count."""
 DOUBTED = 2
 """Unjoined neighbours that are added to those counted: of few views all may be joined by chance."""
+ROUNDS = 30
+"""Of fixed-point iterations: a limit on cost. With 15 the shares of right edges by gap have not settled."""
 FEW = 20
 """Edges of a gap at which the usual share of right edges weighs as much as their own. With 10 the cubicle has one right
 edge more that is not kept.
@@ -79,7 +80,7 @@ def right_by_gap(edges: Ints, vertex_count: int, cycles: Cycles, usual: float) -
     passes = np.bincount(place[cycles.loops.edge], minlength=len(bounds))
     number = np.bincount(place, minlength=len(bounds))
     share = np.full(len(bounds), min(usual, CEILING))
-    for _ in range(MOST_ROUNDS):
+    for _ in range(ROUNDS):
         # EM: in a failing cycle at least one edge is wrong; wrong edges are counted by gap
         close = np.exp(np.bincount(row, np.log(share)[entry], len(loops)))
         wrong = np.bincount(entry, ((1 - share)[entry] / (1 - close[row])), len(bounds))
@@ -195,7 +196,7 @@ def working_point(i_from_j: Floats, probability: Floats) -> tuple[Floats, float]
     if not len(lengths) or usual == 0:
         return np.zeros(3), usual or 1.0
     weight, point = np.ones(len(shift)), np.zeros(3)
-    for _ in range(MOST_ROUNDS):
+    for _ in range(ROUNDS):
         normal = np.einsum("n,nij,nik->jk", weight, rotation, rotation) + 1e-3 * weight.sum() * np.eye(3)
         point = np.linalg.solve(normal, -np.einsum("n,nij,ni->j", weight, rotation, shift))
         displacement_m = np.linalg.norm(rotation @ point + shift, axis=1)
