@@ -139,7 +139,9 @@ def test_a_break_under_all_of_the_window_is_found_by_the_loops() -> None:
         ([(150, 152), (149, 151), (149, 152), (148, 152), (147, 153), (146, 154), (145, 153)], False),
     ],
 )
-def test_a_mistaken_place_in_a_gap_of_the_window_does_not_break_a_step(ends: list[Ints], is_hole: bool) -> None:
+def test_a_mistaken_place_in_a_gap_of_the_window_does_not_break_a_step(
+    ends: list[tuple[int, int]], is_hole: bool
+) -> None:
     """Seven edges that agree with each other outvoted the only right one: few of them are as short as a window's, or
     two loops to another place close a cycle across the step.
     """
