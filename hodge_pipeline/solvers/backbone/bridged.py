@@ -183,11 +183,12 @@ def _as_stated(chain: Chain, found: Inferred, by: LoopJudge) -> Inferred | None:
 
 def _believed(as_stated: Inferred, found: Inferred) -> bool:
     """Whether loops judged with errors no larger than stated are to be believed rather than with learned ones: loops
-    that these explain by larger errors share a mistake.
+    that these explain by larger errors share a mistake, by which all are likelier.
     """
     if not as_stated.confirmed or not as_stated.start.chain.stated:
         return False
-    return not found.confirmed or as_stated.of_mistakes > found.of_mistakes + BY_CHANCE
+    likelier = as_stated.of_places + as_stated.of_mistakes > found.of_places + found.of_mistakes + BY_CHANCE
+    return not found.confirmed or likelier
 
 
 def _better(chain: Chain, found: Inferred, as_stated: Inferred | None, by: LoopJudge) -> tuple[Chain, Inferred] | None:
