@@ -122,17 +122,13 @@ class Chain:
         along = np.clip((steps / own).mean(axis=1) / PLACE, 1 / longest, 1 / STEPS_OF_PLACE)
         return np.asarray(np.cumsum(along)[self.ends])
 
-    def passes(self, at: int, loops: Ints) -> Bools:
-        """Which of the loops (K,) pass over the step to a position."""
-        low, high = self.ends[loops].T
-        return np.asarray((low < at) & (at <= high))
-
     def corridors_over(self, at: int, loops: Ints) -> int:
         """How many corridors (see `corridors`) the loops (K,) that pass over the step to a position belong to: loops of
         a single one, mistaken for another, agree with a break anywhere.
         """
-        ends = self.places[loops[self.passes(at, loops)]]
-        return len(np.unique(corridors(ends[one_of_each_place(ends)]))) if len(ends) else 0
+        low, high = self.ends[loops].T
+        ends = self.places[loops[(low < at) & (at <= high)]]
+        return len(np.unique(corridors(ends[one_of_each_place(ends)])))
 
     def spans(self, edges: Ints) -> Ints:
         """The positions (K, 2) of the vertices of edges (K, 2), the lower first."""

@@ -112,7 +112,7 @@ def _never_contradicted(chain: Chain, shape: Floats) -> tuple[Floats, Floats]:
     whiten = (vectors / np.sqrt(np.maximum(values, least))) @ vectors.T
     off = ((residual @ whiten) ** 2).sum(axis=1)
     far = np.flatnonzero((off >= 1) & (chain.path[a] == chain.path[b]))
-    far = far[one_of_each_place(chain.places[far])] if len(far) else far
+    far = far[one_of_each_place(chain.places[far])]
     if len(far) < PLACES_PER_AXIS * size:
         return across, along
     unit = residual[far] @ whiten / np.sqrt(off[far])[:, None]

@@ -27,26 +27,20 @@ from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.types import Floats, Ints
 
 FOLD = np.log(4.0)
-"""Prior standard deviation of the logarithm of a scale: stated information is seldom wrong by more."""
-FINEST = np.log(2.0) / 2
-"""Last step of the search, in the logarithm of a scale; the first is `FOLD`."""
-DIFFERENT = 2 * FINEST + 1e-9
-"""Difference of logarithms beyond which two scales differ much: over two last steps of the search. Learned scales are
-often exactly so far apart, of which rounding must not decide; to count them as different takes RobotCar's 2438 loops
-from 2.3 to 3.6 CPU s, and from 2.76 to 2.63 m.
+"""Prior standard deviation of the logarithm of a scale: stated information is seldom wrong by more. The search begins
+with steps so long, from starts so far apart, and ends with a quarter of it.
 """
-MOST_RATIO = np.log(2.0)
-"""Largest log-ratio of the scales of rotation and of translation, where information is stated."""
-SMALLER = np.log(4.0) * np.array([0, -1, -2])
-"""Logarithms of common scales; another search begins at the likeliest. By stated errors far too large right loops say
-no more than chance does, and no change of one scale alone makes them likelier.
+MOST_RATIO = FOLD / 2
+"""Largest log-ratio of the scales of rotation and of translation, where information is stated; two scales farther apart
+differ much. Learned scales are often exactly so far apart, two last steps of the search, of which rounding must not
+decide: to count them as different takes RobotCar's 2438 loops from 2.3 to 3.6 CPU s, and from 2.76 to 2.63 m.
 """
-UNITS = np.log(4.0) * np.array([-8, -7, -6, -5, -4, -3, -2, 2, 3, 4, 5, 6, 7, 8])
+ROUNDING = 1e-9
+"""Of logarithms of scales."""
+UNITS = FOLD * np.array([-8, -7, -6, -5, -4, -3, -2, 2, 3, 4, 5, 6, 7, 8])
 """Further starts of the search, logarithms of a common scale, of which the likeliest are searched. From them the scales
 of rotation and translation are independent where the information is the identity, for unknown.
 """
-FARTHEST = 3 * np.log(4.0)
-"""Least distance of further starts from the stated scale: nearer ones would explain mistaken places."""
 DECOYS = 4
 """Decoys per loop: with one, scales of loops differed up to eightfold from one draw to the next."""
 SURPRISING = 2.5
@@ -101,11 +95,11 @@ class Scales:
     @property
     def exceed_stated(self) -> bool:
         """Whether some errors are at least twice what they are stated to be."""
-        return bool(np.log(max(astuple(self))) > DIFFERENT - FINEST)
+        return bool(np.log(max(astuple(self))) > MOST_RATIO / 2 + ROUNDING)
 
     def differ_much(self, other: Scales) -> bool:
         """Whether one of them differs from the other's more than twofold."""
-        return bool((np.abs(np.log(astuple(self)) - np.log(astuple(other))) > DIFFERENT).any())
+        return bool((np.abs(np.log(astuple(self)) - np.log(astuple(other))) > MOST_RATIO + ROUNDING).any())
 
     def at_solution(self, fit: Fit) -> Scales:
         """These scales, by which the fit was made, times how much larger residuals are there than they should be: the
@@ -160,13 +154,14 @@ def learned_scales(chain: Chain, outliers: OutlierModel) -> Iterator[tuple[Scale
     def value(logs: Floats, unit: float) -> float:
         logs = np.minimum(logs, most)
         ratios = np.array([logs[1] - logs[0], logs[3] - logs[2]])
-        if (chain.stated or not unit) and (np.abs(ratios) > MOST_RATIO + 1e-9).any():
+        if (chain.stated or not unit) and (np.abs(ratios) > MOST_RATIO + ROUNDING).any():
             return -np.inf
         prior = -0.5 * float((logs - unit) @ (logs - unit) / FOLD**2)
         return prior + sum(_beyond_chance(logs, *each) for each in both)
 
     found = _likeliest(value, 0.0)
-    units = UNITS[np.abs(UNITS) >= FARTHEST] if chain.stated else UNITS
+    # starts near the stated scale would explain mistaken places
+    units = UNITS[np.abs(UNITS) > 2 * FOLD] if chain.stated else UNITS
     values = np.array([value(np.full(4, unit), unit) for unit in units])
     tried = np.argsort(-values, kind="stable")[:MOST_TRIED]
     tried = tried[values[tried] > found[1]] if chain.stated else tried
@@ -180,7 +175,9 @@ def learned_scales(chain: Chain, outliers: OutlierModel) -> Iterator[tuple[Scale
 
     first = learned(found[0])
     yield first
-    start = max(SMALLER, key=lambda log: value(np.full(4, log), 0.0)) if chain.stated else 0.0
+    # by stated errors far too large right loops say no more than chance does, and no change of one scale alone makes
+    # them likelier
+    start = max((0.0, -FOLD, -2 * FOLD), key=lambda log: value(np.full(4, log), 0.0)) if chain.stated else 0.0
     if start and (second := learned(_likeliest(value, 0.0, start)[0]))[0].differ_much(first[0]):
         yield second
 
@@ -224,9 +221,9 @@ def _likeliest(
     """The maximum of `value` by coordinate search from a common scale `start`, by default the unit: the logarithms (4,)
     of scales, and the value.
     """
-    best, width = np.full(4, unit if start is None else start), FOLD
+    best = np.full(4, unit if start is None else start)
     top = value(best, unit)
-    while width >= FINEST:
+    for width in (FOLD, FOLD / 2, FOLD / 4):
         axis = still = 0
         while still < len(best):
             still += 1
@@ -237,7 +234,6 @@ def _likeliest(
                     best, top, still = tried, found, 0
                     break
             axis += 1
-        width /= 2
     return best, top
 
 
