@@ -16,8 +16,6 @@ from hodge_pipeline.solvers.backbone.linear import linearise, turned
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.types import Bools, Floats, Ints
 
-PLATEAU = 12.0
-"""Nats below the best step at which a step is no candidate for the break."""
 LEAST_COST = 4.0
 """Nats that the residual of a run must cost before its steps are tested: a limit on time. With those of chance, 4.6,
 one of a hundred broken steps is missed.
@@ -115,10 +113,9 @@ def agreed_breaks(pairwise: PairwiseConsistency, usual: StepModel) -> list[Break
         low, high = chain.ends[seed]
         at = np.arange(low + 1, high + 1)
         gain = pairwise.gains(seed, rows, factor)
-        score = chain.over(chain.ends[rows], gain)[at]
-        at, score = at[score > score.max() - PLATEAU], score[score > score.max() - PLATEAU]
         fits = _log_with_usual_step(pairwise, usual, np.full(len(at), seed), at) - pairwise.log_wrong[seed]
-        score = score + np.maximum(fits, 0.0) - pairwise.by_chain[seed] + usual.unusual[at]
+        score = chain.over(chain.ends[rows], gain)[at] + np.maximum(fits, 0.0)
+        score += usual.unusual[at] - pairwise.by_chain[seed]
         may = ~_shifted_aside(pairwise, usual, seed, at)
         fit, far = may & (fits > 0), may & (fits <= 0)
         found = [_break(pairwise, usual, seed, at[fit], score[fit])] if fit.any() else []

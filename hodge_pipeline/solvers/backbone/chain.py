@@ -183,8 +183,7 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
     graph, as_stated = credible_steps(graph, backbone)
     unit = has_unit_information(graph)
     order, step_edge, path = _walk(graph.edges, graph.vertex_count, np.flatnonzero(backbone))
-    place = np.empty(len(order), np.int64)
-    place[order] = np.arange(len(order))
+    place = np.argsort(order)
     axes = free_axes(graph)
     covariance = se3.covariances(graph.information[:, axes[:, None], axes])
     rows = np.flatnonzero(~backbone & (graph.edges[:, 0] != graph.edges[:, 1]))
@@ -224,11 +223,9 @@ def linked(chain: Chain, low: int, high: int, motion: Floats, covariance: Floats
     second = chain.path == high
     after = int(np.flatnonzero(chain.path == low)[-1]) + 1
     moved = np.concatenate([np.arange(after), np.flatnonzero(second), np.flatnonzero(~second[after:]) + after])
-    place = np.empty(chain.size, np.int64)
-    place[moved] = np.arange(chain.size)
     step, step_covariance, bridged = chain.step[moved], chain.step_covariance[moved], chain.bridged[moved]
     step[after], step_covariance[after], bridged[after] = motion, covariance, True
-    ends = place[chain.ends]
+    ends = np.argsort(moved)[chain.ends]
     loop, loop_covariance = _directed(chain.motion, chain.covariance, ends[:, 0] > ends[:, 1], chain.axes, chain.unit)
     return replace(
         chain,

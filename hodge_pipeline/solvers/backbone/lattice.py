@@ -64,9 +64,7 @@ def lattice_backbone(graph: ViewGraph, kept: Bools, doubted: Backbone | None = N
     if doubted is not None and _explains_enough(doubted, kept):
         return doubted, True
     left_out, uncontradicted = left_out_steps(graph, kept)
-    if not _is_rival(left_out, uncontradicted):
-        return None, False
-    backbone = doubted or find_backbone(graph, in_lattice=True)
+    backbone = (doubted or find_backbone(graph, in_lattice=True)) if _is_rival(left_out, uncontradicted) else None
     if backbone is None:
         return None, False
     for_it, against = backbone.places(backbone.used & ~kept), backbone.places_against(kept)

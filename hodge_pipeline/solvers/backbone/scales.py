@@ -13,7 +13,6 @@ from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.credible import MOST_OF_A_STEP
 from hodge_pipeline.solvers.backbone.evidence import (
     BY_CHANCE,
-    EVEN,
     OutlierModel,
     OutlierResiduals,
     mahalanobis,
@@ -22,7 +21,7 @@ from hodge_pipeline.solvers.backbone.evidence import (
 )
 from hodge_pipeline.solvers.backbone.fit import Fit
 from hodge_pipeline.solvers.backbone.levels import FEWEST, MOST_TRIED
-from hodge_pipeline.solvers.backbone.linear import linearise
+from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.types import Floats, Ints
 
@@ -30,13 +29,11 @@ FOLD = np.log(4.0)
 """Prior standard deviation of the logarithm of a scale: stated information is seldom wrong by more. The search begins
 with steps so long, from starts so far apart, and ends with a quarter of it.
 """
-MOST_RATIO = FOLD / 2
+MOST_RATIO = FOLD / 2 + 1e-9
 """Largest log-ratio of the scales of rotation and of translation, where information is stated; two scales farther apart
-differ much. Learned scales are often exactly so far apart, two last steps of the search, of which rounding must not
-decide: to count them as different takes RobotCar's 2438 loops from 2.3 to 3.6 CPU s, and from 2.76 to 2.63 m.
+differ much. Learned scales are often two last steps of the search apart, of which rounding must not decide: to count
+them as different takes RobotCar's 2438 loops from 2.3 to 3.6 CPU s, and from 2.76 to 2.63 m.
 """
-ROUNDING = 1e-9
-"""Of logarithms of scales."""
 UNITS = FOLD * np.array([-8, -7, -6, -5, -4, -3, -2, 2, 3, 4, 5, 6, 7, 8])
 """Further starts of the search, logarithms of a common scale, of which the likeliest are searched. From them the scales
 of rotation and translation are independent where the information is the identity, for unknown.
@@ -95,11 +92,11 @@ class Scales:
     @property
     def exceed_stated(self) -> bool:
         """Whether some errors are at least twice what they are stated to be."""
-        return bool(np.log(max(astuple(self))) > MOST_RATIO / 2 + ROUNDING)
+        return bool(np.log(max(astuple(self))) > MOST_RATIO - FOLD / 4)
 
     def differ_much(self, other: Scales) -> bool:
         """Whether one of them differs from the other's more than twofold."""
-        return bool((np.abs(np.log(astuple(self)) - np.log(astuple(other))) > MOST_RATIO + ROUNDING).any())
+        return bool((np.abs(np.log(astuple(self)) - np.log(astuple(other))) > MOST_RATIO).any())
 
     def at_solution(self, fit: Fit) -> Scales:
         """These scales, by which the fit was made, times how much larger residuals are there than they should be: the
@@ -139,22 +136,21 @@ def learned_scales(chain: Chain, outliers: OutlierModel) -> Iterator[tuple[Scale
     """
     if chain.joins.any():  # beside the covariance of bridges, that of steps is lost in rounding
         chain = chain.parted()
-    poses = chain.poses
-    alone = _within(chain, np.arange(len(chain.ends)), chain.ends)
-    of_decoys = _within(chain, *decoys(chain, DECOYS))
-    own, elsewhere = (_Model.within(chain.with_loops(*each), poses, outliers) for each in (alone, of_decoys))
+    linear = linearise(chain, chain.poses)
+    alone = np.arange(len(chain.ends)), chain.ends
+    own, elsewhere = (_Model.within(linear, outliers, *each) for each in (alone, decoys(chain, DECOYS)))
     both = [(own, elsewhere)]
     one, near = _neighbours(chain)
     if len(one):
         drawn = np.random.default_rng(2).integers(0, len(chain.ends), DECOYS * len(one))
-        by_chance = _Model.beside(chain, poses, outliers, np.repeat(one, DECOYS), np.repeat(near, DECOYS), drawn)
-        both.append((_Model.beside(chain, poses, outliers, one, near), by_chance))
+        by_chance = _Model.beside(linear, outliers, np.repeat(one, DECOYS), np.repeat(near, DECOYS), drawn)
+        both.append((_Model.beside(linear, outliers, one, near, near), by_chance))
     most = _upper_bounds(chain)
 
     def value(logs: Floats, unit: float) -> float:
         logs = np.minimum(logs, most)
         ratios = np.array([logs[1] - logs[0], logs[3] - logs[2]])
-        if (chain.stated or not unit) and (np.abs(ratios) > MOST_RATIO + ROUNDING).any():
+        if (chain.stated or not unit) and (np.abs(ratios) > MOST_RATIO).any():
             return -np.inf
         prior = -0.5 * float((logs - unit) @ (logs - unit) / FOLD**2)
         return prior + sum(_beyond_chance(logs, *each) for each in both)
@@ -248,13 +244,8 @@ def decoys(chain: Chain, times: int) -> tuple[Ints, Ints]:
     return loop, np.sort(np.stack([first, second], axis=1), axis=1)
 
 
-def _within(chain: Chain, loop: Ints, ends: Ints) -> tuple[Ints, Ints]:
-    """Up to `MOST_LOOPS` of the loops (K,) whose ends (K, 2) lie on one path, and these ends."""
-    rows = _some(np.flatnonzero(np.equal(*chain.path[ends].T)))
-    return loop[rows], ends[rows]
-
-
 def _some(rows: Ints) -> Ints:
+    """Up to `MOST_LOOPS` of these rows, drawn at random."""
     if len(rows) <= MOST_LOOPS:
         return rows
     return np.sort(np.random.default_rng(0).choice(rows, MOST_LOOPS, replace=False))
@@ -296,9 +287,11 @@ class _Model:
         return cls(outliers.at(chain, rows, residual), residual, fixed, path, own)
 
     @classmethod
-    def within(cls, chain: Chain, poses: Floats, outliers: OutlierModel) -> _Model:
-        """The cycle of each loop of a chain with the path between its ends."""
-        linear = linearise(chain, poses)
+    def within(cls, linear: Linear, outliers: OutlierModel, loop: Ints, ends: Ints) -> _Model:
+        """The cycle of each loop (K,), moved to these ends (K, 2), with the path between them, if that is one."""
+        rows = _some(np.flatnonzero(np.equal(*linear.chain.path[ends].T)))
+        chain = linear.chain.with_loops(loop[rows], ends[rows])
+        linear = replace(linear, chain=chain)
 
         def parted(scaled: Chain) -> tuple[Floats, Floats]:
             part = replace(linear, chain=scaled)
@@ -307,16 +300,14 @@ class _Model:
         return cls.of(chain, outliers, np.arange(len(chain.ends)), linear.loops[0], parted)
 
     @classmethod
-    def beside(
-        cls, chain: Chain, poses: Floats, outliers: OutlierModel, one: Ints, other: Ints, drawn: Ints | None = None
-    ) -> _Model:
+    def beside(cls, linear: Linear, outliers: OutlierModel, one: Ints, other: Ints, drawn: Ints) -> _Model:
         """The cycle of each loop `one (M,)` with a loop `other (M,)` and the paths between their lower ends and between
-        their upper ends. `drawn (M,)`: loops whose motions replace those of the others.
+        their upper ends. `drawn (M,)`: loops whose motions those of the others are.
         """
-        motions = np.concatenate([one, other if drawn is None else drawn])
-        chain = chain.with_loops(motions, chain.ends[np.concatenate([one, other])])
+        ends = linear.chain.ends[np.concatenate([one, other])]
+        chain = linear.chain.with_loops(np.concatenate([one, drawn]), ends)
         first, second = np.arange(2 * len(one)).reshape(2, -1)
-        linear, none = linearise(chain, poses), np.zeros(len(motions))
+        linear, none = replace(linear, chain=chain), np.zeros(len(ends))
 
         def residuals(scaled: Chain) -> tuple[Floats, Floats]:
             return PairwiseConsistency.of(replace(linear, chain=scaled), none).residuals(second, first)
@@ -329,8 +320,6 @@ class _Model:
 
     def value(self, logs: Floats) -> tuple[float, Floats]:
         """The log-likelihood of scales, against all loops being wrong, and the shares of right and wrong loops."""
-        if not len(self.residual):
-            return 0.0, EVEN
         turn, shift, own_turn, own_shift = np.exp(logs)
         covariance = self.fixed + _weighed(self.path, turn, shift) + _weighed(self.own, own_turn, own_shift)
         factor = student_log_density(self.residual, covariance)[0] - self.outliers.log_density(covariance)

@@ -33,14 +33,13 @@ from hodge_pipeline.solvers.backbone.step_tests import (
 )
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.reweighted import SETTLED
+from hodge_pipeline.solvers.weights import FLOOR
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 WRITTEN, TURNED_RAD = 5e-6, 10.0
 """Largest rounding error, as a share of the number, where six digits are written, as streams of C++ do; and an angle
 that was not taken back to half a turn.
 """
-LEAST = 1e-9
-"""Least weight of an edge, so that the graph stays connected."""
 
 
 def windowed(given: Fused) -> Fused:
@@ -199,7 +198,7 @@ def _agreeing(chain: Chain, near: Ints, fits: Bools, scale: float, doubted: Bool
     )
 
     def solved(weights: Floats, start: Floats) -> Floats:
-        weighted = replace(graph, information=information * np.maximum(weights, LEAST)[:, None, None])
+        weighted = replace(graph, information=information * np.maximum(weights, FLOOR)[:, None, None])
         return solve(weighted, start=start, initial="given", relative_tolerance=TOLERANCE).world_from_cam
 
     poses = solved(weights, chain.poses)
