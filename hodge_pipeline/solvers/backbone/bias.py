@@ -36,7 +36,7 @@ biased graphs one of whose loops 75 are right has none confirmed.
 def without_bias(chain: Chain, scales: Scales) -> Chain | None:
     """The chain without the bias of its steps, by errors of these scales; None where loops do not tell it surely."""
     scaled = scales.applied(chain)
-    rows = np.flatnonzero(chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]])
+    rows = np.flatnonzero(~chain.apart)
     if not len(rows):
         return None
     rows = rows[one_of_each_place(scaled.places[rows])]

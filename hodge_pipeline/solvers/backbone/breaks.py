@@ -107,7 +107,7 @@ class Break:
 def agreed_breaks(pairwise: PairwiseConsistency, usual: StepModel) -> list[Break]:
     """The likeliest break by each seed of loops that agree, one with a usual step and one without; likeliest first."""
     chain = pairwise.chain
-    rows = np.flatnonzero(chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]])
+    rows = np.flatnonzero(~chain.apart)
     out = []
     for seed, factor in pairwise.seeds(rows):
         low, high = chain.ends[seed]
@@ -118,14 +118,14 @@ def agreed_breaks(pairwise: PairwiseConsistency, usual: StepModel) -> list[Break
         score += usual.unusual[at] - pairwise.by_chain[seed]
         may = ~_shifted_aside(pairwise, usual, seed, at)
         fit, far = may & (fits > 0), may & (fits <= 0)
-        found = [_break(pairwise, usual, seed, at[fit], score[fit])] if fit.any() else []
+        if fit.any():
+            out.append(_break(pairwise, usual, seed, at[fit], score[fit]))
         if far.any():
             # bridged as far as the loop asks for: the robot was carried on, or its odometry stood still
             row = np.flatnonzero(far)[np.argmax(score[far])]
             one = int(at[row])
             if chain.corridors_over(one, rows[(factor > 0) & (gain > 0)]) > 1:  # else no trial will show as many
-                found.append(Break(one, *pairwise.bridge(seed, one - 1, one), float(score[row]), usual=False))
-        out += found
+                out.append(Break(one, *pairwise.bridge(seed, one - 1, one), float(score[row]), usual=False))
     return sorted(out, key=lambda each: -each.log_evidence)
 
 
@@ -174,13 +174,12 @@ def unusual_breaks(usual: StepModel) -> list[Break]:
 class Runs:
     """Runs of steps between the ends of used loops, each tested against the solution without it.
 
-    - `pairwise`: of a chain whose loops are the motions of the runs at poses solved without each.
-    - `high (S,)`: later ends, ascending; `cost (S,)`: nats that the residual of each run costs.
+    - `pairwise`: of a chain whose loops are the motions of the runs at poses solved without each, in ascending order.
+    - `cost (S,)`: nats that the residual of each run costs.
     """
 
     pairwise: PairwiseConsistency
     usual: StepModel
-    high: Ints
     cost: Floats
 
     @classmethod
@@ -205,12 +204,13 @@ class Runs:
         )
         none = np.zeros(len(low))
         pairwise = PairwiseConsistency(linearise(others, poses), log_density, none, none > 0)
-        return cls(pairwise, usual, high, 0.5 * (FREEDOM + size) * np.log1p(chi2 / FREEDOM))
+        return cls(pairwise, usual, 0.5 * (FREEDOM + size) * np.log1p(chi2 / FREEDOM))
 
     def score(self, at: Ints) -> Floats:
         """Nats (K,) by which a usual step to these positions is likelier than the measured one; ∞ outside all runs."""
-        run = np.minimum(np.searchsorted(self.high, at), len(self.high) - 1)
-        low, high = self.pairwise.chain.ends[run].T
+        ends = self.pairwise.chain.ends
+        run = np.minimum(np.searchsorted(ends[:, 1], at), len(ends) - 1)
+        low, high = ends[run].T
         inside, out = (low < at) & (at <= high), np.full(len(at), np.inf)
         at, run = at[inside], run[inside]
         gain = _log_with_usual_step(self.pairwise, self.usual, run, at) - self.pairwise.by_chain[run]
@@ -227,5 +227,5 @@ class Runs:
             return None
         at = np.concatenate([np.arange(low + 1, high + 1) for low, high in self.pairwise.chain.ends[costly].tolist()])
         score = self.score(at)
-        run = int(np.searchsorted(self.high, at[np.argmax(score)]))
+        run = int(np.searchsorted(self.pairwise.chain.ends[:, 1], at[np.argmax(score)]))
         return _break(self.pairwise, self.usual, run, at, score)

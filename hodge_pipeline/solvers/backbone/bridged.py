@@ -140,10 +140,13 @@ def _without_shift(chain: Chain, found: Inferred, factor: float, by: LoopJudge) 
         return None
     if same.of_places < found.of_places + OF_A_SHIFT:
         return None
-    again = by.infer(apart)
-    if again is None or not again.confirmed or again.log_evidence < same.log_evidence:
-        again = same
-    return apart, again, rows
+    return apart, _judged_anew(apart, same, by), rows
+
+
+def _judged_anew(chain: Chain, found: Inferred, by: LoopJudge) -> Inferred:
+    """The loops judged with scales learned anew, or as `found` where that is likelier."""
+    again = by.infer(chain)
+    return found if again is None or again.log_evidence < found.log_evidence else again
 
 
 def _contradicted(found: Inferred) -> bool:
@@ -201,8 +204,7 @@ def _better(chain: Chain, found: Inferred, as_stated: Inferred | None, by: LoopJ
         if not broken.usual and _as_far_as_a_mistake(chain, broken, same):
             continue
         if broken.usual or same.start.chain.corridors_over(broken.at, np.flatnonzero(same.used)) > 1:
-            again = by.infer(tried)
-            return tried, same if again is None or again.log_evidence < same.log_evidence else again
+            return tried, _judged_anew(tried, same, by)
     return None
 
 
@@ -255,16 +257,15 @@ def joined(chain: Chain) -> Chain:
     than mistaken places have, or a single loop where hardly any is wrong.
     """
     learned = None
-    while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
+    while chain.apart.any():
         outliers = OutlierModel.of(chain)
         scales, shares = learned = learned or next(learned_scales(chain, outliers))
         linear = linearise(scales.applied(chain), chain.poses)
         log_right, log_wrong = densities(linear, np.arange(len(chain.ends)), outliers)
         pairwise, pairs = PairwiseConsistency.of(linear, log_wrong), chain.path[chain.ends]
-        apart = pairs[:, 0] != pairs[:, 1]
-        refuted = np.flatnonzero(~apart & (log_right < log_wrong - MISTAKEN))
+        refuted = np.flatnonzero(~chain.apart & (log_right < log_wrong - MISTAKEN))
         mistaken = [len(group) for group in agreeing_groups(pairwise, refuted)]
-        odds, two = float(np.log(shares[0] / shares[1])), np.unique(pairs[apart], axis=0)
+        odds, two = float(np.log(shares[0] / shares[1])), np.unique(pairs[chain.apart], axis=0)
         between = [np.flatnonzero((pairs == both).all(axis=1)) for both in two]
         scores = [join_evidence(pairwise, rows, mistaken, odds) for rows in between]
         (score, loop), (low, high) = max(zip(scores, two.tolist(), strict=True))

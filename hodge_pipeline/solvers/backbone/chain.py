@@ -87,6 +87,11 @@ class Chain:
         """Positions (n,) that a bridge from another path leads to."""
         return self.bridged & (self.step_edge < 0)
 
+    @property
+    def apart(self) -> Bools:
+        """Loops (M,) between two paths."""
+        return np.asarray(np.not_equal(*self.path[self.ends].T), bool)
+
     def parted(self) -> Chain:
         """The chain without bridges between its paths."""
         begins = self.step_edge < 0

@@ -48,8 +48,7 @@ class OutlierModel:
 
     def at(self, chain: Chain, rows: Ints, residual: Floats) -> OutlierResiduals:
         """The residuals (K, p) of loops `rows (K,)` in the principal axes of their distribution."""
-        a, b = chain.ends[rows].T
-        apart = chain.path[a] != chain.path[b]
+        (a, b), apart = chain.ends[rows].T, chain.apart[rows]
         octave = np.minimum(np.log2(np.maximum(b - a, 1)).astype(np.int64), len(self.spread) - 1)
         octave[apart] = len(self.spread) - 1
         along = np.swapaxes(self.axes, 1, 2)[octave]
@@ -111,7 +110,7 @@ def _never_contradicted(chain: Chain, shape: Floats) -> tuple[Floats, Floats]:
     least = max(float(values.max()) * np.finfo(float).eps, np.finfo(float).tiny)
     whiten = (vectors / np.sqrt(np.maximum(values, least))) @ vectors.T
     off = ((residual @ whiten) ** 2).sum(axis=1)
-    far = np.flatnonzero((off >= 1) & (chain.path[a] == chain.path[b]))
+    far = np.flatnonzero((off >= 1) & ~chain.apart)
     far = far[one_of_each_place(chain.places[far])]
     if len(far) < PLACES_PER_AXIS * size:
         return across, along

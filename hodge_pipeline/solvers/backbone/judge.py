@@ -75,9 +75,8 @@ def densities(linear: Linear, rows: Ints, outliers: OutlierModel) -> tuple[Float
 
 def _along_path(linear: Linear, rows: Ints, otherwise: float) -> Floats:
     """The covariance (K, p, p) of the path between the ends of loops (rows), `otherwise` between two paths."""
-    a, b = linear.chain.ends[rows].T
-    same = linear.chain.path[a] == linear.chain.path[b]
-    return np.where(same[:, None, None], linear.path(a, b), otherwise)
+    apart = linear.chain.apart[rows, None, None]
+    return np.where(apart, otherwise, linear.path(*linear.chain.ends[rows].T))
 
 
 def _through_ends(fit: Fit) -> Floats:

@@ -27,8 +27,6 @@ at .50 for .47.
 def polished(reduced: Reduced, linear: Linear) -> tuple[Linear, Floats]:
     """The chain at the poses of the active loops, and factors (M,) on the standard deviations of all loops."""
     chain, count, rows = linear.chain, len(linear.chain.ends), reduced.active
-    if not len(rows):
-        return linear, np.ones(count)
     chain = replace(chain, step_covariance=LOCAL**2 * chain.step_covariance)
     wide = np.ones(count)
     # variances of n loops at one place grow by √n, between 1 for independent errors and n for the same error in all
@@ -42,6 +40,6 @@ def polished(reduced: Reduced, linear: Linear) -> tuple[Linear, Floats]:
         chi2 = mahalanobis(residual, covariance * weights[rows, None, None])[0]
         before = weights[rows]
         weights[rows] = tail_weight(chi2, len(chain.axes))
-        if np.abs(weights[rows] - before).max() < SETTLED:
+        if np.abs(weights[rows] - before).max(initial=0.0) < SETTLED:
             break
     return linear, np.sqrt(wide / weights)

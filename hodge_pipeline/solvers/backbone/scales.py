@@ -120,9 +120,7 @@ class Scales:
 
     def units(self, chain: Chain) -> tuple[Floats, Floats]:
         """The factor on each free axis (p,), of steps and of loops."""
-        split, size = chain.rotation_axes, len(chain.axes)
-        pairs = (self.step_turn, self.step_shift), (self.loop_turn, self.loop_shift)
-        step, loop = (np.repeat(pair, (split, size - split)) for pair in pairs)
+        step, loop = np.reshape(astuple(self), (2, 2))[:, (chain.axes >= 3).astype(int)]
         return step, loop
 
 
@@ -187,7 +185,7 @@ def _beyond_chance(logs: Floats, own: _Model, elsewhere: _Model) -> float:
 def _neighbours(chain: Chain) -> tuple[Ints, Ints]:
     """Loops (K,) between two paths, and for each the loop between the same two whose ends are nearest."""
     pairs = chain.path[chain.ends]
-    rows = _some(np.flatnonzero(np.not_equal(*pairs.T)))
+    rows = _some(np.flatnonzero(chain.apart))
     if len(rows) < 2:
         return rows[:0], rows[:0]
     near = cKDTree(chain.ends[rows]).query(chain.ends[rows], k=2, p=np.inf)[1]

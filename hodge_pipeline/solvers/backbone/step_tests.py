@@ -25,7 +25,7 @@ OF_STEPS = 3.0
 def is_tested(chain: Chain) -> bool:
     """Whether short cycles of one loop that close pass over more than `TESTED` of the steps."""
     (low, high), poses = chain.ends.T, chain.poses
-    short = np.flatnonzero((chain.path[low] == chain.path[high]) & (high - low <= LONGEST_CYCLE))
+    short = np.flatnonzero(~chain.apart & (high - low <= LONGEST_CYCLE))
     closing = short[closes(chain.motion[short], _between(poses, low[short], high[short]), gate(chain))]
     return bool((chain.over(chain.ends[closing]) > 0).sum() > TESTED * (chain.step_edge >= 0).sum())
 
