@@ -18,9 +18,9 @@ from hodge_pipeline.solvers.backbone.scales import Scales
 from hodge_pipeline.types import Floats, Ints
 
 MOST_CYCLES = 400
-"""Cycles that a bias is estimated from: their errors are correlated, in a dense matrix."""
-PROPOSED = 100
-"""Most cycles that each propose a bias: over few steps one tells it roughly, over many up to whole turns."""
+"""Cycles that a bias is estimated from: their errors are correlated, in a dense matrix. Each proposes a bias: over few
+steps one tells it roughly, over many up to whole turns.
+"""
 UNSEEN = 0.1
 """Share of its steps below which a cycle does not tell the bias about an axis: others have turned it away."""
 LARGE = 4.0
@@ -36,7 +36,7 @@ biased graphs one of whose loops 75 are right has none confirmed.
 def without_bias(chain: Chain, scales: Scales) -> Chain | None:
     """The chain without the bias of its steps, by errors of these scales; None where loops do not tell it surely."""
     scaled = scales.applied(chain)
-    rows = np.flatnonzero(chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]])
+    rows = np.flatnonzero(~chain.apart)
     if not len(rows):
         return None
     rows = rows[one_of_each_place(scaled.places[rows])]
@@ -127,11 +127,9 @@ class _Cycles:
 
     def _proposed(self) -> Floats:
         """Biases (P, r), zero and those of one cycle each."""
-        some = np.argsort(self.steps, kind="stable")
-        some = some[np.linspace(0, len(some) - 1, min(PROPOSED, len(some))).astype(np.int64)]
-        turned, size = self.turned[some], self.rotation.shape[1]
-        damped = np.swapaxes(turned, 1, 2) @ turned + (UNSEEN * self.steps[some, None, None]) ** 2 * np.eye(size)
-        pull = np.swapaxes(turned, 1, 2) @ self.rotation[some, :, None]
+        back, size = np.swapaxes(self.turned, 1, 2), self.rotation.shape[1]
+        damped = back @ self.turned + (UNSEEN * self.steps[:, None, None]) ** 2 * np.eye(size)
+        pull = back @ self.rotation[..., None]
         return np.concatenate([np.zeros((1, size)), np.linalg.solve(damped, pull)[..., 0]])
 
     def _left(self, bias: Floats) -> Floats:

@@ -8,20 +8,85 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import FREEDOM, STUDENT_99, tail_weight
+from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis, student_log_density
 from hodge_pipeline.solvers.backbone.fit import Fit
-from hodge_pipeline.solvers.backbone.levels import MOST_TRIED
+from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS, MOST_TRIED
 from hodge_pipeline.solvers.backbone.linear import linearise, turned
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
-from hodge_pipeline.solvers.backbone.step_model import StepModel
 from hodge_pipeline.types import Bools, Floats, Ints
 
-PLATEAU = 12.0
-"""Nats below the best step at which a step is no candidate for the break."""
 LEAST_COST = 4.0
 """Nats that the residual of a run must cost before its steps are tested: a limit on time. With those of chance, 4.6,
 one of a hundred broken steps is missed.
 """
+TAIL = 0.1
+"""Share of the most unusual steps, to which the tail of the sizes is fitted (Hill 1975)."""
+LEAST = 1e-6
+"""Share of each variance that is added to it."""
+
+
+@dataclass(frozen=True)
+class StepModel:
+    """The distribution of the motions of a chain's steps.
+
+    - `centre (4, 4)`: of the usual step; `covariance (p, p)`.
+    - `unusual (n,)`: by how many nats each step is rarer than the rarest of as many should be.
+    """
+
+    centre: Floats
+    covariance: Floats
+    unusual: Floats
+
+    @classmethod
+    def of(cls, chain: Chain) -> StepModel:
+        """Fitted to the steps with Student's t, which single steps hardly change, and to the tail of their χ².
+
+        Each step counts with its mirror image, since turns to the right are as usual as those to the left.
+        """
+        rows = np.flatnonzero((chain.step_edge >= 0) & ~chain.bridged)
+        twist = chain.log(chain.step[rows])
+        twist = np.concatenate([twist, twist @ _mirrored(chain, twist)])
+        centre = np.median(twist, axis=0)
+        covariance, chi2 = _student_covariance(twist - centre)
+        unusual = np.full(chain.size, -np.inf)
+        unusual[rows] = _rarity(chi2[: len(rows)]) - np.log(len(rows))
+        return cls(chain.exp(centre), covariance, unusual)
+
+    def off(self, pairwise: PairwiseConsistency, loop: Ints, at: Ints) -> tuple[Floats, Floats]:
+        """Twists (K, p) from the centre to the steps to positions `at (K,)` that loops `loop (K,)` ask for, and the
+        covariances (K, p, p) of these steps.
+        """
+        end, covariance = pairwise.predicted(loop, at - 1, at)
+        chain, asked = pairwise.chain, pairwise.chain.between(pairwise.linear.poses[at - 1], end)
+        return chain.log(chain.between(self.centre, asked)), covariance
+
+
+def _student_covariance(left: Floats) -> tuple[Floats, Floats]:
+    """The covariance (p, p) of residuals (M, p), with weights by Student's t, and their χ² (M,)."""
+    weight = np.ones(len(left))
+    for _ in range(MOST_ROUNDS):
+        covariance = (left * weight[:, None]).T @ left / len(left)
+        covariance += np.diag(LEAST * np.diag(covariance) + np.finfo(float).tiny ** 0.5)
+        chi2 = mahalanobis(left, np.broadcast_to(covariance, (len(left), *covariance.shape)))[0]
+        weight = tail_weight(chi2, left.shape[1])
+    return covariance, chi2
+
+
+def _rarity(chi2: Floats) -> Floats:
+    """Minus the log-probability (M,) of a larger χ², by an exponential tail of the logarithms of these (Hill 1975)."""
+    size = np.log(np.maximum(chi2, np.finfo(float).tiny)) / 2
+    floor = np.quantile(size, 1 - TAIL)
+    mean = float(np.mean(size[size > floor] - floor)) if (size > floor).any() else np.inf
+    return np.asarray(np.maximum((size - floor) / mean + np.log(1 / TAIL), 0.0))
+
+
+def _mirrored(chain: Chain, twist: Floats) -> Floats:
+    """The rotation (p, p) of twists (M, p) by 180° about their median direction of travel."""
+    ahead = np.zeros(6)
+    ahead[chain.axes] = np.median(twist, axis=0)
+    half = 2 * np.outer(ahead[3:], ahead[3:]) / max(float(ahead[3:] @ ahead[3:]), np.finfo(float).tiny) - np.eye(3)
+    return np.asarray(np.kron(np.eye(2), half)[np.ix_(chain.axes, chain.axes)], float)
 
 
 @dataclass(frozen=True)
@@ -42,33 +107,31 @@ class Break:
 def agreed_breaks(pairwise: PairwiseConsistency, usual: StepModel) -> list[Break]:
     """The likeliest break by each seed of loops that agree, one with a usual step and one without; likeliest first."""
     chain = pairwise.chain
-    rows = np.flatnonzero(chain.path[chain.ends[:, 0]] == chain.path[chain.ends[:, 1]])
+    rows = np.flatnonzero(~chain.apart)
     out = []
     for seed, factor in pairwise.seeds(rows):
         low, high = chain.ends[seed]
         at = np.arange(low + 1, high + 1)
         gain = pairwise.gains(seed, rows, factor)
-        score = chain.over(chain.ends[rows], gain)[at]
-        at, score = at[score > score.max() - PLATEAU], score[score > score.max() - PLATEAU]
         fits = _log_with_usual_step(pairwise, usual, np.full(len(at), seed), at) - pairwise.log_wrong[seed]
-        score = score + np.maximum(fits, 0.0) - pairwise.by_chain[seed] + usual.unusual[at]
+        score = chain.over(chain.ends[rows], gain)[at] + np.maximum(fits, 0.0)
+        score += usual.unusual[at] - pairwise.by_chain[seed]
         may = ~_shifted_aside(pairwise, usual, seed, at)
         fit, far = may & (fits > 0), may & (fits <= 0)
-        found = [_break(pairwise, usual, seed, at[fit], score[fit])] if fit.any() else []
+        if fit.any():
+            out.append(_break(pairwise, usual, seed, at[fit], score[fit]))
         if far.any():
             # bridged as far as the loop asks for: the robot was carried on, or its odometry stood still
             row = np.flatnonzero(far)[np.argmax(score[far])]
             one = int(at[row])
             if chain.corridors_over(one, rows[(factor > 0) & (gain > 0)]) > 1:  # else no trial will show as many
-                found.append(Break(one, *pairwise.bridge(seed, one - 1, one), float(score[row]), usual=False))
-        out += found
+                out.append(Break(one, *pairwise.bridge(seed, one - 1, one), float(score[row]), usual=False))
     return sorted(out, key=lambda each: -each.log_evidence)
 
 
 def _log_with_usual_step(pairwise: PairwiseConsistency, usual: StepModel, loop: Ints, at: Ints) -> Floats:
     """Log-density (K,) of `loop (K,)` if it is right and the step to position `at (K,)` is a usual one."""
-    end, covariance = pairwise.predicted(loop, at - 1, at)
-    off = usual.off(pairwise.chain, pairwise.chain.between(pairwise.linear.poses[at - 1], end))
+    off, covariance = usual.off(pairwise, loop, at)
     return student_log_density(off, covariance + usual.covariance)[0]
 
 
@@ -78,8 +141,7 @@ def _break(pairwise: PairwiseConsistency, usual: StepModel, loop: int, at: Ints,
     """
     row = int(np.argmax(score))
     one = at[row : row + 1]
-    end, covariance = pairwise.predicted(np.array([loop]), one - 1, one)
-    off = usual.off(pairwise.chain, pairwise.chain.between(pairwise.linear.poses[one - 1], end))
+    off, covariance = usual.off(pairwise, np.array([loop]), one)
     chi2 = mahalanobis(off, covariance + usual.covariance)[0][0]
     wide = usual.covariance * max(1.0, 1 / float(tail_weight(chi2, off.shape[1])))
     towards = wide @ np.linalg.solve(wide + covariance[0], off[0])
@@ -112,13 +174,12 @@ def unusual_breaks(usual: StepModel) -> list[Break]:
 class Runs:
     """Runs of steps between the ends of used loops, each tested against the solution without it.
 
-    - `pairwise`: of a chain whose loops are the motions of the runs at poses solved without each.
-    - `high (S,)`: later ends, ascending; `cost (S,)`: nats that the residual of each run costs.
+    - `pairwise`: of a chain whose loops are the motions of the runs at poses solved without each, in ascending order.
+    - `cost (S,)`: nats that the residual of each run costs.
     """
 
     pairwise: PairwiseConsistency
     usual: StepModel
-    high: Ints
     cost: Floats
 
     @classmethod
@@ -143,12 +204,13 @@ class Runs:
         )
         none = np.zeros(len(low))
         pairwise = PairwiseConsistency(linearise(others, poses), log_density, none, none > 0)
-        return cls(pairwise, usual, high, 0.5 * (FREEDOM + size) * np.log1p(chi2 / FREEDOM))
+        return cls(pairwise, usual, 0.5 * (FREEDOM + size) * np.log1p(chi2 / FREEDOM))
 
     def score(self, at: Ints) -> Floats:
         """Nats (K,) by which a usual step to these positions is likelier than the measured one; ∞ outside all runs."""
-        run = np.minimum(np.searchsorted(self.high, at), len(self.high) - 1)
-        low, high = self.pairwise.chain.ends[run].T
+        ends = self.pairwise.chain.ends
+        run = np.minimum(np.searchsorted(ends[:, 1], at), len(ends) - 1)
+        low, high = ends[run].T
         inside, out = (low < at) & (at <= high), np.full(len(at), np.inf)
         at, run = at[inside], run[inside]
         gain = _log_with_usual_step(self.pairwise, self.usual, run, at) - self.pairwise.by_chain[run]
@@ -165,5 +227,5 @@ class Runs:
             return None
         at = np.concatenate([np.arange(low + 1, high + 1) for low, high in self.pairwise.chain.ends[costly].tolist()])
         score = self.score(at)
-        run = int(np.searchsorted(self.high, at[np.argmax(score)]))
+        run = int(np.searchsorted(self.pairwise.chain.ends[:, 1], at[np.argmax(score)]))
         return _break(self.pairwise, self.usual, run, at, score)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from hodge_pipeline.complex.chi2 import MEDIAN_CHI2, STUDENT_99
 from hodge_pipeline.solvers.backbone.bias import without_bias
-from hodge_pipeline.solvers.backbone.breaks import Break, Runs, agreed_breaks, unusual_breaks
+from hodge_pipeline.solvers.backbone.breaks import Break, Runs, StepModel, agreed_breaks, unusual_breaks
 from hodge_pipeline.solvers.backbone.chain import Chain, linked
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, OutlierModel, mahalanobis, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, optimised
@@ -22,7 +22,6 @@ from hodge_pipeline.solvers.backbone.mistakes import SAME_SHIFT, shared_shift, w
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.solvers.backbone.places import MISTAKEN, MISTAKEN_PLACES, agreeing_groups
 from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
-from hodge_pipeline.solvers.backbone.step_model import StepModel
 from hodge_pipeline.types import Bools, Ints
 
 MOST_BREAKS, TRIED_AT_ONCE = 10, 2
@@ -141,10 +140,13 @@ def _without_shift(chain: Chain, found: Inferred, factor: float, by: LoopJudge) 
         return None
     if same.of_places < found.of_places + OF_A_SHIFT:
         return None
-    again = by.infer(apart)
-    if again is None or not again.confirmed or again.log_evidence < same.log_evidence:
-        again = same
-    return apart, again, rows
+    return apart, _judged_anew(apart, same, by), rows
+
+
+def _judged_anew(chain: Chain, found: Inferred, by: LoopJudge) -> Inferred:
+    """The loops judged with scales learned anew, or as `found` where that is likelier."""
+    again = by.infer(chain)
+    return found if again is None or again.log_evidence < found.log_evidence else again
 
 
 def _contradicted(found: Inferred) -> bool:
@@ -203,8 +205,7 @@ def _better(chain: Chain, found: Inferred, as_stated: Inferred | None, by: LoopJ
         if not broken.usual and _as_far_as_a_mistake(chain, broken, same):
             continue
         if broken.usual or same.start.chain.corridors_over(broken.at, np.flatnonzero(same.used)) > 1:
-            again = by.infer(tried)
-            return tried, same if again is None or again.log_evidence < same.log_evidence else again
+            return tried, _judged_anew(tried, same, by)
     return None
 
 
@@ -254,35 +255,24 @@ def joined(chain: Chain) -> Chain:
     """The chain with bridges between its paths, such as those of several robots.
 
     Two paths are joined where loops between several places agree on their relative pose, or more loops of one place
-    than mistaken places have, or a single loop where hardly any is wrong. The evidence of two paths is kept while
-    neither is joined to a third, and computed anew before joining ends.
+    than mistaken places have, or a single loop where hardly any is wrong.
     """
-    learned, evidence = None, dict[tuple[int, int], JoinEvidence]()
-    while (chain.path[chain.ends[:, 0]] != chain.path[chain.ends[:, 1]]).any():
-        poses = chain.poses
+    learned = None
+    while chain.apart.any():
         outliers = OutlierModel.of(chain)
         scales, shares = learned = learned or next(learned_scales(chain, outliers))
-        linear, rows = linearise(scales.applied(chain), poses), np.arange(len(chain.ends))
-        log_right, log_wrong = densities(linear, rows, outliers)
+        linear = linearise(scales.applied(chain), chain.poses)
+        log_right, log_wrong = densities(linear, np.arange(len(chain.ends)), outliers)
         pairwise, pairs = PairwiseConsistency.of(linear, log_wrong), chain.path[chain.ends]
-        apart = pairs[:, 0] != pairs[:, 1]
-        refuted = np.flatnonzero(~apart & (log_right < log_wrong - MISTAKEN))
+        refuted = np.flatnonzero(~chain.apart & (log_right < log_wrong - MISTAKEN))
         mistaken = [len(group) for group in agreeing_groups(pairwise, refuted)]
-        two = [(low, high) for low, high in np.unique(pairs[apart], axis=0).tolist()]
-        is_fresh = not evidence
-        for both in two:
-            if both not in evidence:
-                evidence[both] = JoinEvidence.of(pairwise, np.flatnonzero((pairs == both).all(axis=1)))
-        odds = float(np.log(shares[0] / shares[1]))
-        scores = [evidence[both].best(mistaken, odds) for both in two]
-        (score, loop), (low, high) = max(zip(scores, two, strict=True))
-        if score > 0:
-            chain = _joined_by(chain, pairwise, loop, low, high)
-            evidence = {both: each for both, each in evidence.items() if not {low, high} & {*both}}
-        elif is_fresh:
+        odds, two = float(np.log(shares[0] / shares[1])), np.unique(pairs[chain.apart], axis=0)
+        between = [np.flatnonzero((pairs == both).all(axis=1)) for both in two]
+        scores = [join_evidence(pairwise, rows, mistaken, odds) for rows in between]
+        (score, loop), (low, high) = max(zip(scores, two.tolist(), strict=True))
+        if score <= 0:
             break
-        else:
-            evidence = {}
+        chain = _joined_by(chain, pairwise, loop, low, high)
     return chain
 
 
@@ -296,42 +286,24 @@ def _joined_by(chain: Chain, pairwise: PairwiseConsistency, loop: int, low: int,
     return linked(chain, low, high, *exact.bridge(loop, int(last), int(first)))
 
 
-@dataclass(frozen=True)
-class JoinEvidence:
-    """Evidence for the relative pose of two paths, by the loops between them.
+def join_evidence(pairwise: PairwiseConsistency, rows: Ints, mistaken: list[int], odds: float) -> tuple[float, int]:
+    """By how many nats the likeliest of the loops `rows (K,)`, all those between two paths, exceeds what joins these,
+    and this loop: by loops of several places that agree with it, or as the first of the largest group at one place.
 
-    - `of_places`: by how many nats more than by chance loops of several places agree with one, and this loop.
-    - `first`, `size`: the first loop of the largest group at one place, and how many agree with it; `rivals`: the sizes
-      of groups that contradict it.
+    `mistaken`: sizes of groups of wrong loops elsewhere; `odds`: prior log-odds of a loop, the least of a group that
+    no other contradicts.
     """
-
-    of_places: tuple[float, int]
-    first: int
-    size: int
-    rivals: tuple[int, ...]
-
-    @classmethod
-    def of(cls, pairwise: PairwiseConsistency, rows: Ints) -> JoinEvidence:
-        """The evidence of the loops `rows (K,)`, at least one, which join the same two paths."""
-        best = -np.inf, -1
-        for seed, factor in pairwise.seeds(rows) if len(rows) > 1 else ():
-            score = float(pairwise.gains(seed, rows, factor).sum()) - BY_CHANCE - float(np.log(len(pairwise.log_wrong)))
-            best = max(best, (score, seed))
-        groups = agreeing_groups(pairwise, rows)
-        first = int(groups[0][0])
-        factors = [pairwise.factor(np.full(len(group), first), group) for group in groups]
-        rivals = tuple(len(each) for each in factors if each.max() < -MISTAKEN)
-        return cls(best, first, int((factors[0] > 0).sum()), rivals)  # where too many, all loops are a group
-
-    def best(self, mistaken: list[int], odds: float) -> tuple[float, int]:
-        """By how many nats the likeliest loop exceeds what joins two paths, and this loop.
-
-        `mistaken`: sizes of groups of wrong loops elsewhere; `odds`: prior log-odds of a loop, the least of a group
-        that no other contradicts.
-        """
-        sizes = np.array([*mistaken, *self.rivals])
-        likely = max(-_mistaken(self.size, sizes), -np.inf if self.rivals else odds)
-        return max(self.of_places, (likely - MISTAKEN, self.first))
+    groups = agreeing_groups(pairwise, rows)
+    first = int(groups[0][0])
+    factors = [pairwise.factor(np.full(len(group), first), group) for group in groups]
+    rivals = [len(each) for each in factors if each.max() < -MISTAKEN]
+    size = int((factors[0] > 0).sum())  # where too many, all loops are a group
+    likely = max(-_mistaken(size, np.array([*mistaken, *rivals])), -np.inf if rivals else odds)
+    best = likely - MISTAKEN, first
+    for seed, factor in pairwise.seeds(rows) if len(rows) > 1 else ():
+        score = float(pairwise.gains(seed, rows, factor).sum()) - BY_CHANCE - float(np.log(len(pairwise.log_wrong)))
+        best = max(best, (score, seed))
+    return best
 
 
 def _mistaken(size: int, others: Ints) -> float:

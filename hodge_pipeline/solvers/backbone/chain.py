@@ -87,6 +87,11 @@ class Chain:
         """Positions (n,) that a bridge from another path leads to."""
         return self.bridged & (self.step_edge < 0)
 
+    @property
+    def apart(self) -> Bools:
+        """Loops (M,) between two paths."""
+        return np.asarray(np.not_equal(*self.path[self.ends].T), bool)
+
     def parted(self) -> Chain:
         """The chain without bridges between its paths."""
         begins = self.step_edge < 0
@@ -122,17 +127,13 @@ class Chain:
         along = np.clip((steps / own).mean(axis=1) / PLACE, 1 / longest, 1 / STEPS_OF_PLACE)
         return np.asarray(np.cumsum(along)[self.ends])
 
-    def passes(self, at: int, loops: Ints) -> Bools:
-        """Which of the loops (K,) pass over the step to a position."""
-        low, high = self.ends[loops].T
-        return np.asarray((low < at) & (at <= high))
-
     def corridors_over(self, at: int, loops: Ints) -> int:
         """How many corridors (see `corridors`) the loops (K,) that pass over the step to a position belong to: loops of
         a single one, mistaken for another, agree with a break anywhere.
         """
-        ends = self.places[loops[self.passes(at, loops)]]
-        return len(np.unique(corridors(ends[one_of_each_place(ends)]))) if len(ends) else 0
+        low, high = self.ends[loops].T
+        ends = self.places[loops[(low < at) & (at <= high)]]
+        return len(np.unique(corridors(ends[one_of_each_place(ends)])))
 
     def spans(self, edges: Ints) -> Ints:
         """The positions (K, 2) of the vertices of edges (K, 2), the lower first."""
@@ -187,8 +188,7 @@ def make_chain(graph: ViewGraph, backbone: Bools) -> Chain:
     graph, as_stated = credible_steps(graph, backbone)
     unit = has_unit_information(graph)
     order, step_edge, path = _walk(graph.edges, graph.vertex_count, np.flatnonzero(backbone))
-    place = np.empty(len(order), np.int64)
-    place[order] = np.arange(len(order))
+    place = np.argsort(order)
     axes = free_axes(graph)
     covariance = se3.covariances(graph.information[:, axes[:, None], axes])
     rows = np.flatnonzero(~backbone & (graph.edges[:, 0] != graph.edges[:, 1]))
@@ -228,11 +228,9 @@ def linked(chain: Chain, low: int, high: int, motion: Floats, covariance: Floats
     second = chain.path == high
     after = int(np.flatnonzero(chain.path == low)[-1]) + 1
     moved = np.concatenate([np.arange(after), np.flatnonzero(second), np.flatnonzero(~second[after:]) + after])
-    place = np.empty(chain.size, np.int64)
-    place[moved] = np.arange(chain.size)
     step, step_covariance, bridged = chain.step[moved], chain.step_covariance[moved], chain.bridged[moved]
     step[after], step_covariance[after], bridged[after] = motion, covariance, True
-    ends = place[chain.ends]
+    ends = np.argsort(moved)[chain.ends]
     loop, loop_covariance = _directed(chain.motion, chain.covariance, ends[:, 0] > ends[:, 1], chain.axes, chain.unit)
     return replace(
         chain,

@@ -36,20 +36,19 @@ class OutlierModel:
     @classmethod
     def of(cls, chain: Chain) -> OutlierModel:
         """Estimated from the loops' motions put between random positions of one path."""
-        rng, poses = np.random.default_rng(0), chain.poses
+        rng = np.random.default_rng(0)
         pairs = rng.integers(0, chain.size, (RANDOM, 2))
-        shapes = [_shape(chain, poses, pairs[_on_one_path(chain, pairs)], rng)]
+        shapes = [_shape(chain, pairs[_on_one_path(chain, pairs)], rng)]
         for octave in reversed(range(int(np.log2(max(chain.size, 2))))):
             pairs[:, 1] = pairs[:, 0] + rng.integers(2**octave, 2 ** (octave + 1), RANDOM)
             near = pairs[_on_one_path(chain, pairs)]
-            shapes.append(_shape(chain, poses, near, rng) if len(near) >= FEWEST_PAIRS else shapes[0])
+            shapes.append(_shape(chain, near, rng) if len(near) >= FEWEST_PAIRS else shapes[0])
         across, along = _never_contradicted(chain, shapes[0])
         return cls(*np.linalg.eigh(across @ np.stack(shapes[::-1]) @ across + along))
 
     def at(self, chain: Chain, rows: Ints, residual: Floats) -> OutlierResiduals:
         """The residuals (K, p) of loops `rows (K,)` in the principal axes of their distribution."""
-        a, b = chain.ends[rows].T
-        apart = chain.path[a] != chain.path[b]
+        (a, b), apart = chain.ends[rows].T, chain.apart[rows]
         octave = np.minimum(np.log2(np.maximum(b - a, 1)).astype(np.int64), len(self.spread) - 1)
         octave[apart] = len(self.spread) - 1
         along = np.swapaxes(self.axes, 1, 2)[octave]
@@ -85,10 +84,10 @@ def _on_one_path(chain: Chain, pairs: Ints) -> Bools:
     return np.asarray((second == pairs[:, 1]) & (chain.path[pairs[:, 0]] == chain.path[second]))
 
 
-def _shape(chain: Chain, poses: Floats, pairs: Ints, rng: np.random.Generator) -> Floats:
+def _shape(chain: Chain, pairs: Ints, rng: np.random.Generator) -> Floats:
     """The second moment (p, p) of residuals of random loops between these positions (K, 2), without cross terms."""
     motion = chain.motion[rng.integers(0, len(chain.motion), len(pairs))]
-    residual = motion_residuals(chain, motion, poses[pairs[:, 0]], poses[pairs[:, 1]])
+    residual = motion_residuals(chain, motion, chain.poses[pairs[:, 0]], chain.poses[pairs[:, 1]])
     moment, split = residual.T @ residual / max(len(residual), 1), chain.rotation_axes
     shape = np.zeros_like(moment)
     shape[:split, :split], shape[split:, split:] = moment[:split, :split], moment[split:, split:]
@@ -111,8 +110,8 @@ def _never_contradicted(chain: Chain, shape: Floats) -> tuple[Floats, Floats]:
     least = max(float(values.max()) * np.finfo(float).eps, np.finfo(float).tiny)
     whiten = (vectors / np.sqrt(np.maximum(values, least))) @ vectors.T
     off = ((residual @ whiten) ** 2).sum(axis=1)
-    far = np.flatnonzero((off >= 1) & (chain.path[a] == chain.path[b]))
-    far = far[one_of_each_place(chain.places[far])] if len(far) else far
+    far = np.flatnonzero((off >= 1) & ~chain.apart)
+    far = far[one_of_each_place(chain.places[far])]
     if len(far) < PLACES_PER_AXIS * size:
         return across, along
     unit = residual[far] @ whiten / np.sqrt(off[far])[:, None]

@@ -55,7 +55,8 @@ def uncertainty(linear: Linear, fit: Fit | None) -> Floats:
     if fit is None or not len(fit.reduced.active):
         return out + own
     through = _through_ends(fit)
-    return np.asarray(np.where((_trace(through) < _trace(out))[:, None, None], through, out) + own)
+    is_nearer = np.einsum("mii->m", through) < np.einsum("mii->m", out)
+    return np.asarray(np.where(is_nearer[:, None, None], through, out) + own)
 
 
 def by_path(linear: Linear, rows: Ints) -> Floats:
@@ -68,21 +69,14 @@ def by_path(linear: Linear, rows: Ints) -> Floats:
 def densities(linear: Linear, rows: Ints, outliers: OutlierModel) -> tuple[Floats, Floats]:
     """The log-densities (K,) of the residuals of loops (rows) along the bare chain, if they are right and if wrong."""
     covariance, residual = by_path(linear, rows), linear.loops[0][rows]
-    return student_log_density(residual, covariance)[0], outliers.at(linear.chain, rows, residual).log_density(
-        covariance
-    )
+    log_wrong = outliers.at(linear.chain, rows, residual).log_density(covariance)
+    return student_log_density(residual, covariance)[0], log_wrong
 
 
 def _along_path(linear: Linear, rows: Ints, otherwise: float) -> Floats:
     """The covariance (K, p, p) of the path between the ends of loops (rows), `otherwise` between two paths."""
-    a, b = linear.chain.ends[rows].T
-    same = linear.chain.path[a] == linear.chain.path[b]
-    return np.where(same[:, None, None], linear.path(a, b), otherwise)
-
-
-def _trace(covariance: Floats) -> Floats:
-    with np.errstate(invalid="ignore"):
-        return np.where(np.isfinite(covariance[:, 0, 0]), np.einsum("mii->m", covariance), np.inf)
+    apart = linear.chain.apart[rows, None, None]
+    return np.where(apart, otherwise, linear.path(*linear.chain.ends[rows].T))
 
 
 def _through_ends(fit: Fit) -> Floats:
@@ -101,8 +95,6 @@ def _through_ends(fit: Fit) -> Floats:
         along = linear.path(end, reduced.ends[nearest], chain.ends[:, 1])
         gap += np.where(apart[:, None, None], np.inf, along)
         near.append(nearest)
-    component = reduced.network.component
-    at = chain.ends[:, 1]
     pairs, of_loop = np.unique(np.stack(near), axis=1, return_inverse=True)
     first, second = reduced.ends[pairs]
     spread = np.empty((len(first), *gap.shape[1:]))
@@ -110,9 +102,9 @@ def _through_ends(fit: Fit) -> Floats:
         moved = linear.carry(first[rows], second[rows]) @ samples[pairs[0, rows]]
         difference = samples[pairs[1, rows]] - moved
         spread[rows] = difference @ np.swapaxes(difference, 1, 2) / max(SAMPLES - gap.shape[1] - 1, 1)
-    into = linear.carry(second[of_loop], at)
+    into = linear.carry(second[of_loop], chain.ends[:, 1])
     gap += into @ spread[of_loop] @ np.swapaxes(into, 1, 2)
-    gap[component[near[0]] != component[near[1]]] = np.inf
+    gap[np.not_equal(*reduced.network.component[np.stack(near)])] = np.inf
     return gap
 
 

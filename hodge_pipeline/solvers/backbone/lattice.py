@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from hodge_pipeline.solvers.backbone.step_tests import StepCounts, is_tested, left_out_steps
+import numpy as np
+
+from hodge_pipeline.solvers.backbone.chain import make_chain
+from hodge_pipeline.solvers.backbone.sequence import sequential_edges
+from hodge_pipeline.solvers.backbone.step_tests import LONGEST_CYCLE, is_tested, pairs_across
 from hodge_pipeline.solvers.backbone.trust import FEW_BREAKS, Backbone, find_backbone
 from hodge_pipeline.types import Bools, Ints, ViewGraph
 
@@ -28,13 +32,26 @@ def steps_are_wrong(graph: ViewGraph, kept: Bools, loops: Ints) -> bool:
 
     They have all `loops (K,)` that confirm it, and leave out `FEW_BREAKS` or more steps, which near loops contradict.
     """
-    found = left_out_steps(graph, kept)
-    explained = bool(kept[loops].all()) and found.left_out >= FEW_BREAKS
-    return explained and not _is_rival(found)
+    left_out, uncontradicted = left_out_steps(graph, kept)
+    return bool(kept[loops].all()) and left_out >= FEW_BREAKS and not _is_rival(left_out, uncontradicted)
 
 
-def _is_rival(found: StepCounts) -> bool:
-    return found.uncontradicted >= max(UNCONTRADICTED * found.left_out, 1)
+def left_out_steps(graph: ViewGraph, kept: Bools) -> tuple[int, int]:
+    """How many of the consecutive edges are not `kept (E,)`, and how many of these no near loop contradicts.
+
+    A step that was measured wrong is contradicted by a kept loop over few steps, or by a pair of kept loops across it.
+    """
+    chain = make_chain(graph, sequential_edges(graph))
+    ends = chain.ends[kept[chain.loop_edge]]
+    short = ends[np.diff(ends, axis=1)[:, 0] <= LONGEST_CYCLE]
+    left_out = ~np.append(kept, True)[chain.step_edge]
+    across = pairs_across(ends, left_out | ~chain.inner)[1]
+    uncontradicted = left_out & (chain.over(np.concatenate([short, across])) == 0)
+    return int(left_out.sum()), int(uncontradicted.sum())
+
+
+def _is_rival(left_out: int, uncontradicted: int) -> bool:
+    return uncontradicted >= max(UNCONTRADICTED * left_out, 1)
 
 
 def lattice_backbone(graph: ViewGraph, kept: Bools, doubted: Backbone | None = None) -> tuple[Backbone | None, bool]:
@@ -46,14 +63,12 @@ def lattice_backbone(graph: ViewGraph, kept: Bools, doubted: Backbone | None = N
     """
     if doubted is not None and _explains_enough(doubted, kept):
         return doubted, True
-    found = left_out_steps(graph, kept)
-    if not _is_rival(found):
-        return None, False
-    backbone = doubted or find_backbone(graph, in_lattice=True)
+    left_out, uncontradicted = left_out_steps(graph, kept)
+    backbone = (doubted or find_backbone(graph, in_lattice=True)) if _is_rival(left_out, uncontradicted) else None
     if backbone is None:
         return None, False
     for_it, against = backbone.places(backbone.used & ~kept), backbone.places_against(kept)
-    unlikely = found.left_out if doubted or not backbone.found.confirmed else found.uncontradicted
+    unlikely = left_out if doubted or not backbone.found.confirmed else uncontradicted
     if against < PLACES_PER_WRONG_STEP * unlikely:
         return backbone, True
     weight = PLACES_PER_WRONG_STEP if is_tested(backbone.chain) else 1.0

@@ -18,8 +18,7 @@ of a second lap counted, each of which says nothing alone beside 160 m of drift.
 
 def loops_at_place(ends: Floats) -> Floats:
     """How many loops (M,), itself included, are of the same place as each; `ends (M, 2)` as in `Chain.places`."""
-    near = cKDTree(ends).query_ball_point(ends, 1.0, p=np.inf, return_length=True) if len(ends) else []
-    return np.asarray(near, float)
+    return np.asarray(cKDTree(ends).query_ball_point(ends, 1.0, p=np.inf, return_length=True), float)
 
 
 def one_of_each_place(ends: Floats) -> Ints:
@@ -34,8 +33,6 @@ def one_of_each_place(ends: Floats) -> Ints:
 
 def corridors(ends: Floats) -> Ints:
     """The corridor (K,) of each loop: a run of adjacent places, cut to `LONGEST_CORRIDOR`; `ends (K, 2)` in places."""
-    if not len(ends):
-        return np.zeros(0, np.int64)
     run = connected_components(cKDTree(ends).query_pairs(ADJACENT, p=np.inf, output_type="ndarray"), len(ends))
     order = np.argsort(run, kind="stable")
     first = np.unique(run[order], return_index=True)[1]

@@ -46,19 +46,14 @@ MOST_PAIRS = 200_000
 class Arrangement:
     """Places assumed right (K,), the fit with one loop of each, and the log-odds of this assumption.
 
-    - `log_ways`: n of N places can be mistaken in about N^n / n! ways, of which `log_odds` count N^n. These compare
-      changes of one place; whether the places are right at all is for `of_all` to say.
+    - `of_all`: the log-odds that all are right, against as many mistaken ones. n of N places can be mistaken in about
+      N^n / n! ways, of which `log_odds` count N^n, to compare changes of one place.
     """
 
     right: Bools
     fit: Fit
     log_odds: float
-    log_ways: float
-
-    @property
-    def of_all(self) -> float:
-        """The log-odds that all are right, against as many mistaken ones."""
-        return self.log_odds + self.log_ways
+    of_all: float
 
 
 @dataclass(frozen=True)
@@ -130,7 +125,8 @@ class Places:
         # without rivals MISTAKEN_PLACES counts once, not for each place
         prior = max(len(active) - 1, 0) * float(np.log(MISTAKEN_PLACES)) - float(self.rivals(right)[active].sum())
         n = len(active) - np.searchsorted(np.sort(self.size[active]), self.size[active])  # that have as many loops
-        return Arrangement(right, fit, self._density(fit) + prior, float((gammaln(n + 1) / n).sum()))
+        log_odds = self._density(fit) + prior
+        return Arrangement(right, fit, log_odds, log_odds + float((gammaln(n + 1) / n).sum()))
 
     def _density(self, fit: Fit) -> float:
         """The log-density of all active loops, against all being wrong: one Student's t for all, since all errors may

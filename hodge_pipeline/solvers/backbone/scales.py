@@ -13,7 +13,6 @@ from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.credible import MOST_OF_A_STEP
 from hodge_pipeline.solvers.backbone.evidence import (
     BY_CHANCE,
-    EVEN,
     OutlierModel,
     OutlierResiduals,
     mahalanobis,
@@ -22,31 +21,23 @@ from hodge_pipeline.solvers.backbone.evidence import (
 )
 from hodge_pipeline.solvers.backbone.fit import Fit
 from hodge_pipeline.solvers.backbone.levels import FEWEST, MOST_TRIED
-from hodge_pipeline.solvers.backbone.linear import linearise
+from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.types import Floats, Ints
 
 FOLD = np.log(4.0)
-"""Prior standard deviation of the logarithm of a scale: stated information is seldom wrong by more."""
-FINEST = np.log(2.0) / 2
-"""Last step of the search, in the logarithm of a scale; the first is `FOLD`."""
-DIFFERENT = 2 * FINEST + 1e-9
-"""Difference of logarithms beyond which two scales differ much: over two last steps of the search. Learned scales are
-often exactly so far apart, of which rounding must not decide; to count them as different takes RobotCar's 2438 loops
-from 2.3 to 3.6 CPU s, and from 2.76 to 2.63 m.
+"""Prior standard deviation of the logarithm of a scale: stated information is seldom wrong by more. The search begins
+with steps so long, from starts so far apart, and ends with a quarter of it.
 """
-MOST_RATIO = np.log(2.0)
-"""Largest log-ratio of the scales of rotation and of translation, where information is stated."""
-SMALLER = np.log(4.0) * np.array([0, -1, -2])
-"""Logarithms of common scales; another search begins at the likeliest. By stated errors far too large right loops say
-no more than chance does, and no change of one scale alone makes them likelier.
+MOST_RATIO = FOLD / 2 + 1e-9
+"""Largest log-ratio of the scales of rotation and of translation, where information is stated; two scales farther apart
+differ much. Learned scales are often two last steps of the search apart, of which rounding must not decide: to count
+them as different takes RobotCar's 2438 loops from 2.3 to 3.6 CPU s, and from 2.76 to 2.63 m.
 """
-UNITS = np.log(4.0) * np.array([-8, -7, -6, -5, -4, -3, -2, 2, 3, 4, 5, 6, 7, 8])
+UNITS = FOLD * np.array([-8, -7, -6, -5, -4, -3, -2, 2, 3, 4, 5, 6, 7, 8])
 """Further starts of the search, logarithms of a common scale, of which the likeliest are searched. From them the scales
 of rotation and translation are independent where the information is the identity, for unknown.
 """
-FARTHEST = 3 * np.log(4.0)
-"""Least distance of further starts from the stated scale: nearer ones would explain mistaken places."""
 DECOYS = 4
 """Decoys per loop: with one, scales of loops differed up to eightfold from one draw to the next."""
 SURPRISING = 2.5
@@ -101,11 +92,11 @@ class Scales:
     @property
     def exceed_stated(self) -> bool:
         """Whether some errors are at least twice what they are stated to be."""
-        return bool(np.log(max(astuple(self))) > DIFFERENT - FINEST)
+        return bool(np.log(max(astuple(self))) > MOST_RATIO - FOLD / 4)
 
     def differ_much(self, other: Scales) -> bool:
         """Whether one of them differs from the other's more than twofold."""
-        return bool((np.abs(np.log(astuple(self)) - np.log(astuple(other))) > DIFFERENT).any())
+        return bool((np.abs(np.log(astuple(self)) - np.log(astuple(other))) > MOST_RATIO).any())
 
     def at_solution(self, fit: Fit) -> Scales:
         """These scales, by which the fit was made, times how much larger residuals are there than they should be: the
@@ -129,9 +120,7 @@ class Scales:
 
     def units(self, chain: Chain) -> tuple[Floats, Floats]:
         """The factor on each free axis (p,), of steps and of loops."""
-        split, size = chain.rotation_axes, len(chain.axes)
-        pairs = (self.step_turn, self.step_shift), (self.loop_turn, self.loop_shift)
-        step, loop = (np.repeat(pair, (split, size - split)) for pair in pairs)
+        step, loop = np.reshape(astuple(self), (2, 2))[:, (chain.axes >= 3).astype(int)]
         return step, loop
 
 
@@ -145,28 +134,28 @@ def learned_scales(chain: Chain, outliers: OutlierModel) -> Iterator[tuple[Scale
     """
     if chain.joins.any():  # beside the covariance of bridges, that of steps is lost in rounding
         chain = chain.parted()
-    poses = chain.poses
-    alone = _within(chain, np.arange(len(chain.ends)), chain.ends)
-    of_decoys = _within(chain, *decoys(chain, DECOYS))
-    own, elsewhere = (_Model.within(chain.with_loops(*each), poses, outliers) for each in (alone, of_decoys))
+    linear = linearise(chain, chain.poses)
+    alone = np.arange(len(chain.ends)), chain.ends
+    own, elsewhere = (_Model.within(linear, outliers, *each) for each in (alone, decoys(chain, DECOYS)))
     both = [(own, elsewhere)]
     one, near = _neighbours(chain)
     if len(one):
         drawn = np.random.default_rng(2).integers(0, len(chain.ends), DECOYS * len(one))
-        by_chance = _Model.beside(chain, poses, outliers, np.repeat(one, DECOYS), np.repeat(near, DECOYS), drawn)
-        both.append((_Model.beside(chain, poses, outliers, one, near), by_chance))
+        by_chance = _Model.beside(linear, outliers, np.repeat(one, DECOYS), np.repeat(near, DECOYS), drawn)
+        both.append((_Model.beside(linear, outliers, one, near, near), by_chance))
     most = _upper_bounds(chain)
 
     def value(logs: Floats, unit: float) -> float:
         logs = np.minimum(logs, most)
         ratios = np.array([logs[1] - logs[0], logs[3] - logs[2]])
-        if (chain.stated or not unit) and (np.abs(ratios) > MOST_RATIO + 1e-9).any():
+        if (chain.stated or not unit) and (np.abs(ratios) > MOST_RATIO).any():
             return -np.inf
         prior = -0.5 * float((logs - unit) @ (logs - unit) / FOLD**2)
         return prior + sum(_beyond_chance(logs, *each) for each in both)
 
     found = _likeliest(value, 0.0)
-    units = UNITS[np.abs(UNITS) >= FARTHEST] if chain.stated else UNITS
+    # starts near the stated scale would explain mistaken places
+    units = UNITS[np.abs(UNITS) > 2 * FOLD] if chain.stated else UNITS
     values = np.array([value(np.full(4, unit), unit) for unit in units])
     tried = np.argsort(-values, kind="stable")[:MOST_TRIED]
     tried = tried[values[tried] > found[1]] if chain.stated else tried
@@ -180,7 +169,9 @@ def learned_scales(chain: Chain, outliers: OutlierModel) -> Iterator[tuple[Scale
 
     first = learned(found[0])
     yield first
-    start = max(SMALLER, key=lambda log: value(np.full(4, log), 0.0)) if chain.stated else 0.0
+    # by stated errors far too large right loops say no more than chance does, and no change of one scale alone makes
+    # them likelier
+    start = max((0.0, -FOLD, -2 * FOLD), key=lambda log: value(np.full(4, log), 0.0)) if chain.stated else 0.0
     if start and (second := learned(_likeliest(value, 0.0, start)[0]))[0].differ_much(first[0]):
         yield second
 
@@ -194,7 +185,7 @@ def _beyond_chance(logs: Floats, own: _Model, elsewhere: _Model) -> float:
 def _neighbours(chain: Chain) -> tuple[Ints, Ints]:
     """Loops (K,) between two paths, and for each the loop between the same two whose ends are nearest."""
     pairs = chain.path[chain.ends]
-    rows = _some(np.flatnonzero(np.not_equal(*pairs.T)))
+    rows = _some(np.flatnonzero(chain.apart))
     if len(rows) < 2:
         return rows[:0], rows[:0]
     near = cKDTree(chain.ends[rows]).query(chain.ends[rows], k=2, p=np.inf)[1]
@@ -224,9 +215,9 @@ def _likeliest(
     """The maximum of `value` by coordinate search from a common scale `start`, by default the unit: the logarithms (4,)
     of scales, and the value.
     """
-    best, width = np.full(4, unit if start is None else start), FOLD
+    best = np.full(4, unit if start is None else start)
     top = value(best, unit)
-    while width >= FINEST:
+    for width in (FOLD, FOLD / 2, FOLD / 4):
         axis = still = 0
         while still < len(best):
             still += 1
@@ -237,7 +228,6 @@ def _likeliest(
                     best, top, still = tried, found, 0
                     break
             axis += 1
-        width /= 2
     return best, top
 
 
@@ -252,13 +242,8 @@ def decoys(chain: Chain, times: int) -> tuple[Ints, Ints]:
     return loop, np.sort(np.stack([first, second], axis=1), axis=1)
 
 
-def _within(chain: Chain, loop: Ints, ends: Ints) -> tuple[Ints, Ints]:
-    """Up to `MOST_LOOPS` of the loops (K,) whose ends (K, 2) lie on one path, and these ends."""
-    rows = _some(np.flatnonzero(np.equal(*chain.path[ends].T)))
-    return loop[rows], ends[rows]
-
-
 def _some(rows: Ints) -> Ints:
+    """Up to `MOST_LOOPS` of these rows, drawn at random."""
     if len(rows) <= MOST_LOOPS:
         return rows
     return np.sort(np.random.default_rng(0).choice(rows, MOST_LOOPS, replace=False))
@@ -300,9 +285,11 @@ class _Model:
         return cls(outliers.at(chain, rows, residual), residual, fixed, path, own)
 
     @classmethod
-    def within(cls, chain: Chain, poses: Floats, outliers: OutlierModel) -> _Model:
-        """The cycle of each loop of a chain with the path between its ends."""
-        linear = linearise(chain, poses)
+    def within(cls, linear: Linear, outliers: OutlierModel, loop: Ints, ends: Ints) -> _Model:
+        """The cycle of each loop (K,), moved to these ends (K, 2), with the path between them, if that is one."""
+        rows = _some(np.flatnonzero(np.equal(*linear.chain.path[ends].T)))
+        chain = linear.chain.with_loops(loop[rows], ends[rows])
+        linear = replace(linear, chain=chain)
 
         def parted(scaled: Chain) -> tuple[Floats, Floats]:
             part = replace(linear, chain=scaled)
@@ -311,16 +298,14 @@ class _Model:
         return cls.of(chain, outliers, np.arange(len(chain.ends)), linear.loops[0], parted)
 
     @classmethod
-    def beside(
-        cls, chain: Chain, poses: Floats, outliers: OutlierModel, one: Ints, other: Ints, drawn: Ints | None = None
-    ) -> _Model:
+    def beside(cls, linear: Linear, outliers: OutlierModel, one: Ints, other: Ints, drawn: Ints) -> _Model:
         """The cycle of each loop `one (M,)` with a loop `other (M,)` and the paths between their lower ends and between
-        their upper ends. `drawn (M,)`: loops whose motions replace those of the others.
+        their upper ends. `drawn (M,)`: loops whose motions those of the others are.
         """
-        motions = np.concatenate([one, other if drawn is None else drawn])
-        chain = chain.with_loops(motions, chain.ends[np.concatenate([one, other])])
+        ends = linear.chain.ends[np.concatenate([one, other])]
+        chain = linear.chain.with_loops(np.concatenate([one, drawn]), ends)
         first, second = np.arange(2 * len(one)).reshape(2, -1)
-        linear, none = linearise(chain, poses), np.zeros(len(motions))
+        linear, none = replace(linear, chain=chain), np.zeros(len(ends))
 
         def residuals(scaled: Chain) -> tuple[Floats, Floats]:
             return PairwiseConsistency.of(replace(linear, chain=scaled), none).residuals(second, first)
@@ -333,8 +318,6 @@ class _Model:
 
     def value(self, logs: Floats) -> tuple[float, Floats]:
         """The log-likelihood of scales, against all loops being wrong, and the shares of right and wrong loops."""
-        if not len(self.residual):
-            return 0.0, EVEN
         turn, shift, own_turn, own_shift = np.exp(logs)
         covariance = self.fixed + _weighed(self.path, turn, shift) + _weighed(self.own, own_turn, own_shift)
         factor = student_log_density(self.residual, covariance)[0] - self.outliers.log_density(covariance)

@@ -86,9 +86,7 @@ class Factored:
     @property
     def log_det(self) -> float:
         """The logarithm of the determinant of the normal equations."""
-        pivots = self.blocks.pivots
-        inverted = float(np.linalg.slogdet(pivots)[1].sum()) if len(pivots) else 0.0
-        return (float(np.linalg.slogdet(self.core)[1]) if self.core.size else 0.0) - inverted
+        return float(np.linalg.slogdet(self.core)[1] - np.linalg.slogdet(self.blocks.pivots)[1].sum())
 
     def solve(self, force: Floats) -> Floats:
         """The solution x (N, p, c) for right-hand sides (N, p, c); 0 at fixed vertices."""
@@ -116,13 +114,12 @@ class Factored:
     def _inverse(self) -> tuple[Floats, Floats]:
         plan, p = self.network.plan, self.carry.shape[-1]
         diagonal, rows = np.zeros((plan.size + 1, p, p)), np.zeros((len(plan.slot_rows) + 1, p, p))
-        begin = plan.core
-        if begin < plan.size:
-            dense = np.linalg.inv(self.core).reshape(plan.size - begin, p, plan.size - begin, p)
-            diagonal[begin : plan.size] = np.einsum("iajb->ijab", dense)[(np.arange(plan.size - begin),) * 2]
-            first = plan.groups[-1].slots.stop if plan.groups else 0
-            a, b = plan.slot_rows[first:] - begin, plan.slot_columns[first:] - begin
-            rows[first:-1] = dense[a, :, b, :]
+        begin, left = plan.core, plan.size - plan.core
+        dense = np.linalg.inv(self.core).reshape(left, p, left, p)
+        diagonal[begin : plan.size] = np.einsum("iaib->iab", dense)
+        first = plan.groups[-1].slots.stop if plan.groups else 0
+        a, b = plan.slot_rows[first:] - begin, plan.slot_columns[first:] - begin
+        rows[first:-1] = dense[a, :, b, :]
         for group in reversed(plan.groups):
             self._of_group(group, diagonal, rows)
         return diagonal, rows
@@ -130,17 +127,13 @@ class Factored:
     def _of_group(self, group: Group, diagonal: Floats, rows: Floats) -> None:
         plan, (count, k) = self.network.plan, group.neighbours.shape
         pivots = self.blocks.pivots[group.begin : group.end]
-        diagonal[group.begin : group.end] = pivots
-        if not k:
-            return
-        p = pivots.shape[-1]
+        p, each = pivots.shape[-1], np.arange(k)
         between = np.empty((count, k, k, p, p))
-        each = np.arange(k)
         between[:, each, each] = diagonal[group.neighbours]
         a, b = np.triu_indices(k, 1)
         off = rows[group.blocks[a, b].T - plan.size]
         between[:, a, b], between[:, b, a] = off, np.swapaxes(off, 2, 3)
         wide = side_by_side(self.blocks.rows[group.slots].reshape(count, k, p, p))
         across = -wide @ between.transpose(0, 1, 3, 2, 4).reshape(count, k * p, k * p)
-        diagonal[group.begin : group.end] -= across @ np.swapaxes(wide, 1, 2)
+        diagonal[group.begin : group.end] = pivots - across @ np.swapaxes(wide, 1, 2)
         rows[group.slots] = across.reshape(count, p, k, p).transpose(0, 2, 1, 3).reshape(count * k, p, p)

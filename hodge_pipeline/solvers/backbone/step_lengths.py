@@ -51,8 +51,6 @@ def misstated_lengths(fitted: Chain, poses: Floats, used: Ints) -> list[StepLeng
     path = np.cumsum(fitted.step_edge < 0) - 1
     alone = [measured & (path == number) for number in np.unique(path[measured])]
     groups = [measured, *alone] if len(alone) > 1 else [measured]
-    if not len(used):
-        return []
     places = thinned(fitted, used[one_of_each_place(fitted.places[used])])
     freedom = len(fitted.axes) * (len(places.active) - len(np.unique(path[fitted.ends[places.active]])) + 1)
     found: list[StepLength] = []

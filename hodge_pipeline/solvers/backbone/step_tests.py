@@ -1,17 +1,14 @@
-"""Short cycles of a backbone: whether they test its steps, which steps they contradict, which loops agree."""
+"""Short cycles of a backbone: whether they test its steps, which loops agree."""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from hodge_pipeline import se3
-from hodge_pipeline.solvers.backbone.chain import Chain, make_chain
+from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis
-from hodge_pipeline.solvers.backbone.sequence import sequential_edges
-from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+from hodge_pipeline.types import Bools, Floats, Ints
 
 LOOPS_AT_A_STEP = 0.5
 """Loops per step beyond which the graph may be a lattice, or a room, in which no edge needs to be trusted."""
@@ -28,33 +25,9 @@ OF_STEPS = 3.0
 def is_tested(chain: Chain) -> bool:
     """Whether short cycles of one loop that close pass over more than `TESTED` of the steps."""
     (low, high), poses = chain.ends.T, chain.poses
-    short = np.flatnonzero((chain.path[low] == chain.path[high]) & (high - low <= LONGEST_CYCLE))
+    short = np.flatnonzero(~chain.apart & (high - low <= LONGEST_CYCLE))
     closing = short[closes(chain.motion[short], _between(poses, low[short], high[short]), gate(chain))]
     return bool((chain.over(chain.ends[closing]) > 0).sum() > TESTED * (chain.step_edge >= 0).sum())
-
-
-class StepCounts(NamedTuple):
-    """How many steps are left out and no near loop contradicts, and how many are left out at all."""
-
-    uncontradicted: int
-    left_out: int
-
-
-def left_out_steps(graph: ViewGraph, kept: Bools) -> StepCounts:
-    """How many of the consecutive edges are not `kept (E,)`, and how many of these no near loop contradicts.
-
-    A step that was measured wrong is contradicted by a kept loop over few steps, or by a pair of kept loops across it.
-    """
-    chain = make_chain(graph, sequential_edges(graph))
-    inner = chain.step_edge >= 0
-    ends = chain.ends[kept[chain.loop_edge]]
-    near = [ends[np.diff(ends, axis=1)[:, 0] <= LONGEST_CYCLE]]
-    left_out = ~np.append(kept, True)[chain.step_edge]
-    if len(ends):
-        near.append(pairs_across(ends, left_out | ~inner)[1])
-    out = inner & left_out
-    uncontradicted = out & (chain.over(np.concatenate(near)) == 0)
-    return StepCounts(int(uncontradicted.sum()), int(out.sum()))
 
 
 def pairs_across(ends: Ints, steps: Bools) -> tuple[Ints, Ints]:

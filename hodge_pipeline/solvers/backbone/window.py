@@ -33,14 +33,13 @@ from hodge_pipeline.solvers.backbone.step_tests import (
 )
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.reweighted import SETTLED
+from hodge_pipeline.solvers.weights import FLOOR
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 WRITTEN, TURNED_RAD = 5e-6, 10.0
 """Largest rounding error, as a share of the number, where six digits are written, as streams of C++ do; and an angle
 that was not taken back to half a turn.
 """
-LEAST = 1e-9
-"""Least weight of an edge, so that the graph stays connected."""
 
 
 def windowed(given: Fused) -> Fused:
@@ -56,7 +55,9 @@ def windowed(given: Fused) -> Fused:
     at, near = np.flatnonzero(chain.step_edge >= 0), _near(chain)
     if not _many(chain, near):
         return given
-    closing, unknown = _closing(chain, near), has_unit_information(graph)
+    low, high = chain.ends[near].T
+    along = se3.inverse(chain.poses[low]) @ chain.poses[high]
+    closing, unknown = closes(chain.motion[near], along, gate(chain), np.sqrt(high - low)), has_unit_information(graph)
     if unknown and 2 * closing.sum() < len(near):  # errors that are learned from wrong edges would explain all
         return given
     learned = _with_learned_covariance(chain, near) if unknown else chain
@@ -92,10 +93,9 @@ def _near(chain: Chain) -> Ints:
     half of all positions have loops of each length of.
     """
     low, high = chain.ends.T
-    same = chain.path[low] == chain.path[high]
-    gap = np.where(same, high - low, chain.size)
+    gap = np.where(chain.apart, chain.size, high - low)
     rare = np.bincount(gap, minlength=chain.size)[2:] < 0.5 * chain.size
-    return np.flatnonzero(same & (gap <= max(STEPS_OF_PLACE, 1 + int(np.argmax(np.append(rare, True))))))
+    return np.flatnonzero(~chain.apart & (gap <= max(STEPS_OF_PLACE, 1 + int(np.argmax(np.append(rare, True))))))
 
 
 def _many(chain: Chain, rows: Ints) -> bool:
@@ -119,13 +119,6 @@ def _with_learned_covariance(chain: Chain, near: Ints) -> Chain:
     step[chain.step_edge >= 0] = np.diag(variance)
     loop[near] = np.diff(ends, axis=1)[:, :, None] * np.diag(variance)
     return replace(chain, step_covariance=step, covariance=loop)
-
-
-def _closing(chain: Chain, near: Ints) -> Bools:
-    """Which of the `near` loops (K,) close with the steps as those of right edges do."""
-    low, high = chain.ends[near].T
-    ahead = se3.inverse(chain.poses[low]) @ chain.poses[high]
-    return closes(chain.motion[near], ahead, gate(chain), np.sqrt(high - low))
 
 
 def _fitting(chain: Chain, near: Ints, closing: Bools) -> tuple[Bools, float, Bools, Bools]:
@@ -199,7 +192,7 @@ def _agreeing(chain: Chain, near: Ints, fits: Bools, scale: float, doubted: Bool
     )
 
     def solved(weights: Floats, start: Floats) -> Floats:
-        weighted = replace(graph, information=information * np.maximum(weights, LEAST)[:, None, None])
+        weighted = replace(graph, information=information * np.maximum(weights, FLOOR)[:, None, None])
         return solve(weighted, start=start, initial="given", relative_tolerance=TOLERANCE).world_from_cam
 
     poses = solved(weights, chain.poses)
