@@ -150,11 +150,6 @@ class Evidence:
     weight: Floats
     exhaustive: bool
 
-    def select(self, rows: Ints) -> Evidence:
-        """The evidence of these edges (rows), among all vertices."""
-        edges = {name: getattr(self, name)[rows] for name in ("prior", "support", "in_no_listed_cycle", "weight")}
-        return replace(self, graph=self.graph.select(rows), noise=self.noise.select(rows), **edges)
-
 
 def gather(graph: ViewGraph, options: DiagnosisOptions) -> tuple[Evidence, Cycles, Floats]:
     """The evidence, the listed cycles, and the working point (3,) in the axes of each frame."""
