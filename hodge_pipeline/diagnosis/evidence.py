@@ -168,8 +168,6 @@ def gather(graph: ViewGraph, options: DiagnosisOptions) -> tuple[Evidence, Cycle
         prior = right_by_gap(edges, count, cycles, usual) if options.order_prior else np.minimum(prior, usual)
     elif options.order_prior and np.ptp(prior) == 0:
         prior = _if_neighbours_stand_out(edges, right_by_gap(edges, count, cycles, usual))
-        noise = edge_noise(graph, there, loops, *errors, prior, reach_m)
-        cycles = judge_cycles(loops, *errors, noise, reach_m)
     support = closing_support(cycles, prior)
     weight = prior / (1 - prior) * (0.5 + support) / (1 + support)
     weight *= 1 + TIE_BREAK * np.random.default_rng(0).random(len(weight))
