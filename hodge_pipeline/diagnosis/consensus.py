@@ -66,7 +66,9 @@ def best_arrangement(evidence: Evidence, start: Solved) -> Solved:
     in_order = fit(evidence, _in_order(evidence), TWICE)
     starts = (start,) if np.array_equal(start.used, in_order.used) else (start, in_order)
     found = [fit(evidence, align(evidence, searched(evidence, begun)), ONCE) for begun in starts]
-    return max(found, key=lambda one: arrangement_log_evidence(evidence, one, learn_scene_model(evidence, one)))
+    models = [learn_scene_model(evidence, one) for one in found]
+    values = [sum(arrangement_log_evidence(evidence, one, model) for model in models) for one in found]
+    return found[int(np.argmax(values))]
 
 
 def _mended(evidence: Evidence, grown: Alignment) -> Solved:
