@@ -63,9 +63,11 @@ def _gains(evidence: Evidence, votes: Votes) -> Floats:
     """Log-evidence (nats) for each hypothesis (N,): the weights of the edges that agree, and a term that grows with
     the logarithm of their number. 0 for a vote that is no hypothesis.
     """
-    size, strength = len(votes.edge), votes.agreement * evidence.weight[votes.edge[votes.vote]]
+    size, weight = len(votes.edge), evidence.weight
+    strength = votes.agreement * weight[votes.edge[votes.vote]]
+    counted = votes.agreement * np.minimum(1.0, 0.5 + weight[votes.edge[votes.vote]])
     gain = np.bincount(votes.hypothesis, strength, size)
-    return np.asarray(gain + PER_FOLD * np.log1p(np.bincount(votes.hypothesis, votes.agreement, size)))
+    return np.asarray(gain + PER_FOLD * np.log1p(np.bincount(votes.hypothesis, counted, size)))
 
 
 def _joins(votes: Votes, gain: Floats, count: int) -> tuple[Ints, Bools]:
