@@ -90,7 +90,7 @@ def _in_order(evidence: Evidence) -> Alignment:
     by one end and by wrong ones.
     """
     steps = np.abs(evidence.graph.edges[:, 1] - evidence.graph.edges[:, 0]) == 1
-    return align(evidence, align(evidence.select(np.flatnonzero(steps))))
+    return align(evidence, align(evidence, along=steps))
 
 
 def _misfit(found: Solved) -> float:

@@ -30,7 +30,6 @@ from hodge_pipeline.solvers.backbone.lattice import lattice_backbone, steps_are_
 from hodge_pipeline.solvers.backbone.sequence import sequential_edges, vertex_ranks
 from hodge_pipeline.solvers.backbone.step_tests import is_tested
 from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
-from hodge_pipeline.solvers.resistance import Network
 from hodge_pipeline.solvers.weights import OUT_OF_PLANE, dimension_of
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
@@ -161,9 +160,8 @@ class _ByCycles:
         agrees = agreeing(evidence, fit)
         cycles = _with_witnesses(self.cycles, fit.used, evidence)
         blame = share_blame(cycles, fit, evidence)
-        untestable = evidence.in_no_listed_cycle | blame.undecided | blame.unconfirmed
+        untestable = evidence.in_no_listed_cycle | blame.untestable
         probability = np.where(untestable, np.nan, np.maximum(agrees, blame.probability))
-        undecided = np.where(blame.unconfirmed | (blame.probability > 0) | blame.undecided, blame.cycle, -1)
         right = (probability >= CONSISTENT_FROM) & fit.used
         wrong = probability < WRONG_BELOW
         verdict = np.select([untestable, right, wrong], [UNTESTABLE, CONSISTENT, WRONG], SUSPECT)
@@ -172,20 +170,17 @@ class _ByCycles:
         cycles = replace(cycles, loops=cycles.loops.reversed_edges(self.turned))
         named_cycles = witnesses(cycles, probability, True), witnesses(cycles, probability, False)
         found = Diagnosis.of(
-            stated,
+            replace(stated, information=_information(evidence.noise, there, stated.dimension == 2)),
             verdict=verdict,
             probability=probability,
-            reasons=partial(reasons, stated, cycles, verdict, named_cycles, undecided, fit.bridge),
+            reasons=partial(reasons, stated, cycles, verdict, named_cycles, blame.cycle, fit.bridge),
             kept=kept,
-            network=Network.of(stated.edges[kept], stated.vertex_count),
             cycles=cycles,
             witnesses=named_cycles,
             world_from_cam=world_from_cam,
             tested=(f"cycles: {int(cycles.closes.sum())} of {len(cycles.loops)} close",),
         )
-        information = _information(evidence.noise, there, stated.dimension == 2)
-        notes = (*found.notes, *evidence.noise.doubts, *free_direction_notes(stated))
-        return replace(found, information=information, notes=notes)
+        return replace(found, notes=(*found.notes, *evidence.noise.doubts, *free_direction_notes(stated)))
 
 
 def _with_witnesses(cycles: Cycles, used: Bools, evidence: Evidence) -> Cycles:

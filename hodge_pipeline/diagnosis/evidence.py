@@ -135,9 +135,8 @@ class Evidence:
     """Edges between frames at the working point, and what is known of them before any alignment.
 
     - `graph`: with the noise as information; `noise` of each edge; `reach_m`: usual distance of overlapping views.
-    - `prior (E,)`: probability that an edge is right by the order of the views; `support (E,)`: cycles that close over
-      it, weighted by the prior of their other edges; `in_no_listed_cycle (E,)`.
-    - `weight (E,)` of an edge's vote.
+    - `prior (E,)`: probability that an edge is right by the order of the views; `in_no_listed_cycle (E,)`.
+    - `weight (E,)` of an edge's vote: its odds by the prior, more where cycles close over it.
     - `exhaustive`: whether registration seems to have been tried on all pairs.
     """
 
@@ -145,15 +144,9 @@ class Evidence:
     noise: Noise
     reach_m: float
     prior: Floats
-    support: Floats
     in_no_listed_cycle: Bools
     weight: Floats
     exhaustive: bool
-
-    def select(self, rows: Ints) -> Evidence:
-        """The evidence of these edges (rows), among all vertices."""
-        edges = {name: getattr(self, name)[rows] for name in ("prior", "support", "in_no_listed_cycle", "weight")}
-        return replace(self, graph=self.graph.select(rows), noise=self.noise.select(rows), **edges)
 
 
 def gather(graph: ViewGraph, options: DiagnosisOptions) -> tuple[Evidence, Cycles, Floats]:
@@ -173,13 +166,11 @@ def gather(graph: ViewGraph, options: DiagnosisOptions) -> tuple[Evidence, Cycle
         prior = right_by_gap(edges, count, cycles, usual) if options.order_prior else np.minimum(prior, usual)
     elif options.order_prior and np.ptp(prior) == 0:
         prior = _if_neighbours_stand_out(edges, right_by_gap(edges, count, cycles, usual))
-        noise = edge_noise(graph, there, loops, *errors, prior, reach_m)
-        cycles = judge_cycles(loops, *errors, noise, reach_m)
     support = closing_support(cycles, prior)
     weight = prior / (1 - prior) * (0.5 + support) / (1 + support)
     weight *= 1 + TIE_BREAK * np.random.default_rng(0).random(len(weight))
     known = replace(there, information=noise.information)
-    found = Evidence(known, noise, reach_m, prior, support, loops.missing(len(edges)), weight, exhaustive)
+    found = Evidence(known, noise, reach_m, prior, loops.missing(len(edges)), weight, exhaustive)
     return found, cycles, point
 
 

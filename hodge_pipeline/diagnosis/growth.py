@@ -36,13 +36,13 @@ class Alignment:
     poses: Floats
 
 
-def align(evidence: Evidence, start: Alignment | None = None) -> Alignment:
-    """The alignment by greedy merging, of single vertices or of the pieces of a start."""
+def align(evidence: Evidence, start: Alignment | None = None, along: Bools | bool = True) -> Alignment:
+    """The alignment by greedy merging, of single vertices or of the pieces of a start; `along (E,)`: by these edges."""
     count, weight = evidence.graph.vertex_count, evidence.weight
     piece, poses = np.arange(count), np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
     if start is not None:
         piece, poses = start.piece.copy(), start.poses.copy()
-    while (votes := collect_votes(evidence, piece, poses)) is not None:
+    while (votes := collect_votes(evidence, piece, poses, along)) is not None:
         joined, moves_low = _joins(votes, _gains(evidence, votes), count)
         if not len(joined):
             break
@@ -116,9 +116,9 @@ class Votes:
     agreement: Floats
 
 
-def collect_votes(evidence: Evidence, piece: Ints, piece_from: Floats) -> Votes | None:
-    """The votes of all edges between two pieces; None where there is none."""
-    edge = np.flatnonzero(piece[evidence.graph.edges[:, 0]] != piece[evidence.graph.edges[:, 1]])
+def collect_votes(evidence: Evidence, piece: Ints, piece_from: Floats, along: Bools | bool) -> Votes | None:
+    """The votes of the edges `along (E,)` between two pieces; None where there is none."""
+    edge = np.flatnonzero(along & np.not_equal(*piece[evidence.graph.edges.T]))
     if not len(edge):
         return None
     tail, head = evidence.graph.edges[edge].T

@@ -12,7 +12,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import MEDIAN_CHI2, has_unit_information, mean_variances
 from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.solvers.backbone.levels import FEWEST, SIGMAS
-from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+from hodge_pipeline.types import Bools, Floats, ViewGraph
 
 DEFAULT_ANGLE_RAD, DEFAULT_SHARE = 0.03, 0.05
 """Standard deviations of an edge where too few cycles close to estimate them; of translation as a share of the reach.
@@ -61,10 +61,6 @@ class Noise:
         out[:, range(3), range(3)] = 1 / self.rotation_rad[:, None] ** 2
         out[:, range(3, 6), range(3, 6)] = 1 / self.translation_m[:, None] ** 2
         return out
-
-    def select(self, rows: Ints | Bools) -> Noise:
-        """The noise of these edges."""
-        return Noise(self.rotation_rad[rows], self.translation_m[rows], self.doubts)
 
 
 def edge_noise(

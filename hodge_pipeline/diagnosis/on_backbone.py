@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hodge_pipeline.complex.closing import cycle_errors
+from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.cycles import WITNESSES, Cycles
@@ -16,7 +17,6 @@ from hodge_pipeline.diagnosis.result import CONSISTENT, SUSPECT, UNTESTABLE, WRO
 from hodge_pipeline.diagnosis.wording import distance
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.trust import Backbone
-from hodge_pipeline.solvers.resistance import Network
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 MOST_ENTRIES = 500_000
@@ -30,8 +30,8 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone) -> Diagnosis:
     kept = backbone.used
     in_loop = np.zeros(graph.edge_count, bool)
     in_loop[np.flatnonzero(kept)] = series_classes(graph.edges[kept], graph.vertex_count) >= 0
-    network = Network.of(graph.edges[kept], graph.vertex_count)
-    tested = np.where(backbone.steps, in_loop, np.equal(*network.component[graph.edges.T]))
+    piece = connected_components(graph.edges[kept], graph.vertex_count)
+    tested = np.where(backbone.steps, in_loop, np.equal(*piece[graph.edges.T]))
     probability = np.where(tested, np.where(backbone.steps, RIGHT_STEP, backbone.right), np.nan)
     refuted = backbone.steps & ~kept | backbone.contradicted
     probability[refuted] = 1 - RIGHT_STEP
@@ -46,7 +46,6 @@ def judged_on_backbone(graph: ViewGraph, backbone: Backbone) -> Diagnosis:
         probability=probability,
         reasons=partial(_reasons, graph.edges, backbone, verdict),
         kept=kept,
-        network=network,
         cycles=cycles,
         witnesses=(np.where(kept[:, None], witness, -1), np.where(kept[:, None], -1, witness)),
         world_from_cam=backbone.world_from_cam,

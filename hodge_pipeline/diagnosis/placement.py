@@ -29,8 +29,6 @@ ROUNDING = 1e-9
 """Tolerance on the trace of a rotation."""
 JUMP = 1e-4
 """Probability that consecutive views do not see the same place."""
-UNSUPPORTED, SUPPORTED = 0.05, 0.3
-"""Closing cycles over an edge: added to each count, and the count that leaves the odds unchanged."""
 
 
 def log_evidence(sums: Floats) -> Floats:
@@ -108,10 +106,10 @@ class Placements:
 
     @cached_property
     def consecutive(self) -> Floats:
-        """The log-evidence (P,) of edges between consecutive views; 0 for other pairs."""
+        """The log-evidence (P,) of edges between consecutive views, by their weight; 0 for other pairs."""
         edges, out = self.evidence.graph.edges, np.zeros(len(self.pairs))
         rows = np.flatnonzero(np.abs(edges[:, 1] - edges[:, 0]) == 1)
-        consecutive = consecutive_log_evidence(self.evidence)[rows]
+        consecutive = np.log1p(self.evidence.weight[rows])
         np.maximum.at(out, self.row.reshape(2, -1)[:, rows].ravel(), np.tile(consecutive, 2))
         return out
 
@@ -145,12 +143,6 @@ class Placements:
     def held(self, rotations: Floats, up: Floats) -> Floats:
         """Upright log-evidence (V,) of camera rotations (V, 3, 3) where up is (V, 3); 0 without a model."""
         return self.model.upright.log_evidence(rotations, up) if self.model else np.zeros(len(rotations))
-
-
-def consecutive_log_evidence(evidence: Evidence) -> Floats:
-    """Log-evidence (E,) of each edge, if it joins consecutive views, by its prior odds and closing cycles."""
-    odds = evidence.prior / (1 - evidence.prior) * (evidence.support + UNSUPPORTED) / SUPPORTED
-    return np.asarray(np.log1p(odds))
 
 
 def arrangement_log_evidence(evidence: Evidence, found: Solved, model: SceneModel) -> float:

@@ -66,7 +66,6 @@ class Diagnosis:
         probability: Floats,
         reasons: Callable[[tuple[Floats, Floats]], tuple[str, ...]],
         kept: Bools,
-        network: Network,
         cycles: Cycles,
         witnesses: tuple[Ints, Ints],
         world_from_cam: Floats,
@@ -76,6 +75,7 @@ class Diagnosis:
         """The diagnosis with these verdicts, whose pieces are those of the kept edges; `reasons` makes the lines from
         residuals (E,), metres and degrees; `tested`: notes on what tested the edges.
         """
+        network = Network.of(graph.edges[kept], graph.vertex_count)
         piece = network.component
         apart = piece[graph.edges[:, 0]] != piece[graph.edges[:, 1]]
         by_id = np.argsort(vertex_ranks(graph))
@@ -86,7 +86,7 @@ class Diagnosis:
         leverage = np.where(kept, 1 - 1 / (1 + effective_resistance(graph.edges, kept, network)), 0.0)
         notes = f"edges: {count_verdicts(verdict)}", *tested, *describe_components(piece, graph.vertex_ids)
         columns = verdict, probability, reasons(residual), kept, *residual, leverage, graph.information, cycles
-        return cls(*columns, *witnesses, network.component, world_from_cam, network, notes, findings)
+        return cls(*columns, *witnesses, piece, world_from_cam, network, notes, findings)
 
     def __repr__(self) -> str:
         return f"Diagnosis({len(self.verdict)} edges: {count_verdicts(self.verdict)})"

@@ -24,8 +24,6 @@ ANNEALED = (1e4, 1e3, 300.0)
 """Decreasing gates for poses that drifted in growth: edges far off pull them into place before they are dropped
 (graduated non-convexity, Yang et al. 2020).
 """
-DIMENSION = 6
-"""Degrees of freedom of an edge."""
 ROUNDS = 4
 """Reweighting rounds of a solve."""
 FULLY, QUICKLY = Limits(20, 1e-6), Limits(6, 1e-4)
@@ -65,7 +63,7 @@ def fit(evidence: Evidence, alignment: Alignment, gates: tuple[float, ...], init
         if following < gate and np.array_equal(used, found.chi2 < following):
             continue
         rough, widened = gate > GATE, max(gate / GATE, 1.0)
-        first = found.chi2 / widened if rough else np.full(len(used), float(DIMENSION))
+        first = found.chi2 / widened if rough else np.full(len(used), 6.0)
         limits = QUICKLY if rough or len(used) > LARGE else FULLY
         poses, squares = _solve(evidence, found.poses, used, first, limits, widened, initial)
         piece = connected_components(evidence.graph.edges[used], evidence.graph.vertex_count)
@@ -98,7 +96,7 @@ def _solve(
     rotations, translations = setup.initial(initial)
     exact = np.zeros(len(poses), np.int64), np.zeros(len(used))
     for _ in range(ROUNDS):
-        share = tail_weight(squares[used], DIMENSION)[setup.weights.used]
+        share = tail_weight(squares[used], 6)[setup.weights.used]
         problem = replace(setup.problem, kappa=share * setup.problem.kappa, tau=share * setup.problem.tau)
         point = descend_isotropic(problem, (rotations, translations), limits, setup.rounding).point
         rotations, translations, poses = point.rotations, point.translations, setup.poses(point)

@@ -19,7 +19,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.diagnosis.cycles import CLOSES_BELOW
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import PER_FOLD, Alignment, agreement_of, mean_motions
-from hodge_pipeline.diagnosis.placement import Placements, consecutive_log_evidence, log_evidence
+from hodge_pipeline.diagnosis.placement import Placements, log_evidence
 from hodge_pipeline.diagnosis.robust_poses import ONCE, Solved, fit
 from hodge_pipeline.diagnosis.scene_model import learn_scene_model
 from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS
@@ -32,7 +32,7 @@ TRIED, TOGETHER = 200, 50_000
 dominates.
 """
 MOST_PROPOSALS = 1000
-"""Edges that propose a motion, the likeliest by the order of the views: a limit on cost."""
+"""Edges that propose a motion, those of most weight: a limit on cost."""
 LEAST_GAIN, LEAST_OF_FEW = 2.0, 0.7
 """Least gain of a move, nats; and where not every pair was tried, so that few edges agree by chance: 2 edges against 1,
 4 against 2."""
@@ -85,12 +85,11 @@ def _moves(here: Placements) -> list[Move]:
     edges, agreeing = evidence.graph.edges, here.current_layers[0][here.row[: evidence.graph.edge_count]]
     i, j = edges.T
     rows = np.flatnonzero((agreeing == 0) & (i != j))
-    consecutive = consecutive_log_evidence(evidence)
-    rows = np.sort(rows[np.argsort(-consecutive[rows], kind="stable")[:MOST_PROPOSALS]])
+    rows = np.sort(rows[np.argsort(-evidence.weight[rows], kind="stable")[:MOST_PROPOSALS]])
     proposals = Proposals.of(evidence, here.found.poses, rows)
     in_order = (np.abs(j - i) == 1) & (here.usual > 0)
     priority = PER_FOLD * np.log1p(np.asarray(proposals.alike.sum(axis=1)).ravel())
-    priority += np.where(in_order, consecutive, 0.0)[proposals.edge]
+    priority += np.where(in_order, np.log1p(evidence.weight), 0.0)[proposals.edge]
     turned = proposals.motion[:, :3, :3] @ here.found.poses[proposals.mover, :3, :3]
     priority += here.held(turned, here.up[proposals.stayer])
     tried = proposals.by_priority(priority, TRIED)

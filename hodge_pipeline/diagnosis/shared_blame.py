@@ -17,19 +17,17 @@ from hodge_pipeline.types import Bools, Floats, Ints
 class SharedBlame:
     """Where an alignment had to leave out one of several edges that no cycle distinguishes.
 
-    - `unconfirmed (E,)`: used edges that may be wrong in place of one left out: edges in series with it, and bridges
-      over which no cycle closes.
-    - `cycle (E,)`: the shortest failing cycle of each unconfirmed or undecided edge, and of each edge left out in place
-      of one; −1 elsewhere.
+    - `untestable (E,)`: used edges that may be wrong in place of one left out, which are those in series with it and
+      bridges over which no cycle closes; and edges whose only test is one failing cycle.
+    - `cycle (E,)`: the shortest failing cycle of each untestable edge, and of each edge left out in place of one; −1
+      elsewhere.
     - `probability (E,)`: that an edge left out in place of another is right, by the prior odds of the edges of its
       cycle, of which one is wrong; 0 elsewhere.
-    - `undecided (E,)`: edges whose only test is one failing cycle.
     """
 
-    unconfirmed: Bools
+    untestable: Bools
     cycle: Ints
     probability: Floats
-    undecided: Bools
 
 
 def share_blame(cycles: Cycles, fit: Solved, evidence: Evidence) -> SharedBlame:
@@ -55,7 +53,7 @@ def share_blame(cycles: Cycles, fit: Solved, evidence: Evidence) -> SharedBlame:
     probability = np.zeros(count)
     named = left_out & (cycle >= 0)  # of a large graph the longest cycles are not listed
     probability[named] = 1 - odds[named] / among[cycle[named]]
-    return SharedBlame(unconfirmed, cycle, probability, undecided)
+    return SharedBlame(unconfirmed | undecided, cycle, probability)
 
 
 def _in_series_with(chosen: Bools, classes: Ints) -> Bools:
