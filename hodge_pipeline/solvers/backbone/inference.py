@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,7 +21,7 @@ from hodge_pipeline.solvers.backbone.mistakes import Mistake, mistakes
 from hodge_pipeline.solvers.backbone.pairwise import likely_together
 from hodge_pipeline.solvers.backbone.places import MISTAKEN, Places, factors_by_chance
 from hodge_pipeline.solvers.backbone.polish import polished
-from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
+from hodge_pipeline.solvers.backbone.scales import DRIFTING, Scales, learned_scales
 from hodge_pipeline.types import Bools, Floats, Ints
 
 ROUNDS = 6
@@ -97,15 +97,14 @@ class LoopJudge:
 
         `scales`: of the errors; by default those learned from the loops by which their places are likelier, and learned
         anew at the poses that they lead to where the drift of a long path had hidden how loops err: where scales there
-        differ much, other loops agree by them, and the places are likelier.
+        differ much, other loops agree by them, and the places are likelier. Where nothing is confirmed, steps may turn
+        wrongly by more than they shift: for long one way, as a gyroscope drifts.
         """
-        learned = learned_scales(chain, self.outliers) if scales is None else [(scales, EVEN)]
-        found: Inferred | None = None
-        for given in learned:
-            other = _Trial.of(chain, self, *given).found()
-            if other is None:
-                return None
-            found = other if found is None or other.rank > found.rank else found
+        found = self._best(chain, learned_scales(chain, self.outliers) if scales is None else [(scales, EVEN)])
+        if scales is None and found is not None and not found.confirmed and chain.stated:
+            other = self._best(chain, learned_scales(chain, self.outliers, DRIFTING))
+            if other is not None and other.confirmed and other.of_places > MISTAKEN + BY_CHANCE:
+                found = other
         for _ in range(MOST_ANEW if scales is None else 0):
             if found is None or not found.confirmed:
                 break
@@ -116,6 +115,16 @@ class LoopJudge:
             if other is None or other.rank <= found.rank:
                 break
             found = other
+        return found
+
+    def _best(self, chain: Chain, learned: Iterable[tuple[Scales, Floats]]) -> Inferred | None:
+        """The loops judged by the best of these scales, each with shares (2,) of right and wrong ones."""
+        found: Inferred | None = None
+        for given in learned:
+            other = _Trial.of(chain, self, *given).found()
+            if other is None:
+                return None
+            found = other if found is None or other.rank > found.rank else found
         return found
 
     def refused_alike(self, chain: Chain, scales: Scales) -> tuple[Linear, Mistake | None]:
