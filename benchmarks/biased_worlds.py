@@ -1,7 +1,8 @@
-"""Walks through streets, and flights above them, whose odometry turns too far at each step, as a biased gyroscope does.
+"""Walks through streets, and flights above them, whose odometry turns too far at each step, as a biased gyroscope does,
+or one whose bias drifts.
 
 It turns about the vertical, or nearly so in flight: gravity tells the tilt. Its drift grows with the square of the
-path, while the information states independent errors.
+path, or of the steps over which a drifting bias remembers, while the information states independent errors.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 STEP_M, STREET, STREETS = 2.0, 20, 5
 """Length of a step, steps of a street between two corners, and corners in each direction."""
+DRIFTING = 899
+"""Steps with a bias that drifts."""
 TURN_RAD, SHIFT_M = 0.003, 0.03
 """Standard deviations of a step; loops err twice as much."""
 
@@ -37,7 +40,23 @@ def biased_cases(seed: int) -> Iterator[Case]:
     for number, (flat, steps, bias, (wrong, kind), stated) in enumerate(itertools.chain(kinds, more)):
         rng = np.random.default_rng([seed, number])
         name = f"{'walk' if flat else 'flight'} of {steps}, {bias * TURN_RAD} rad a step too much, {wrong:.0%} {kind}"
-        yield _case(f"{name} wrong, stated × {stated}", flat, steps, bias * TURN_RAD, wrong, kind, stated, rng)
+        turns = np.full(steps - 1, bias * TURN_RAD)
+        yield _case(f"{name} wrong, stated × {stated}", flat, turns, wrong, kind, stated, rng)
+
+
+def drifting_cases(seed: int) -> Iterator[Case]:
+    """900 steps whose headings drift by .5 to 2 rad in all, by a bias that is remembered over 8 to 200 of them; 0 to 80
+    % of the loops wrong.
+    """
+    kinds = itertools.product((True, False), (8, 50, 200), (0.5, 1.0, 2.0), (0.0, 0.5, 0.8))
+    for number, (flat, over, drift, wrong) in enumerate(kinds):
+        rng = np.random.default_rng([seed, number])
+        kept = np.exp(-1 / over)
+        turns, drawn = np.zeros(DRIFTING), drift / np.sqrt(2 * over * DRIFTING) * rng.standard_normal(DRIFTING)
+        for step in range(DRIFTING):
+            turns[step] = kept * turns[step - 1] + np.sqrt(1 - kept**2 if step else 1.0) * drawn[step]
+        name = f"{'walk' if flat else 'flight'}, {drift} rad by a bias over {over} steps, {wrong:.0%} wrong"
+        yield _case(name, flat, turns, wrong, "random", 1.0, rng)
 
 
 def _streets(steps: int, rng: np.random.Generator) -> Floats:
@@ -57,8 +76,10 @@ def _streets(steps: int, rng: np.random.Generator) -> Floats:
 
 
 def _case(
-    name: str, flat: bool, steps: int, bias: float, wrong: float, kind: str, stated: float, rng: np.random.Generator
+    name: str, flat: bool, turns: Floats, wrong: float, kind: str, stated: float, rng: np.random.Generator
 ) -> Case:
+    """The case with these turns (n − 1,) too far, in radians."""
+    steps = len(turns) + 1
     poses = _streets(steps, rng)
     if not flat:
         tilt = rng.normal(0, 0.1, (steps, 3)).cumsum(axis=0) / 10
@@ -73,7 +94,7 @@ def _case(
     mistaken = _mistaken(kind, poses, round(len(good) * wrong / (1 - wrong)), free, rng)
     pairs, motions = np.concatenate([pairs, mistaken[0]]), np.concatenate([motions, mistaken[1]])
     axis = np.array([0, 0, rng.choice([-1, 1])]) + (not flat) * rng.normal(0, 0.2, 3)
-    turn = se3.exp(np.concatenate([bias * axis / np.linalg.norm(axis), np.zeros(3)])[None])
+    turn = se3.exp(np.outer(turns, np.concatenate([axis / np.linalg.norm(axis), np.zeros(3)])))
     path = np.stack([np.arange(steps - 1), np.arange(1, steps)], axis=1)
     motions = np.concatenate([se3.inverse(poses[:-1]) @ poses[1:] @ turn, motions])
     edges = np.concatenate([path, pairs])

@@ -94,6 +94,10 @@ def _bridged(unbroken: Chain, first: Inferred, by: LoopJudge, most: int) -> tupl
             break
         chain, found = better
         as_stated = _as_stated(chain, found, by)
+    if chain is not unbroken and found.scales.steps_surprise:  # turns that drift one way for long look like a break
+        drifting = by.drifting(unbroken)
+        if drifting is not None and drifting.confirmed and drifting.of_places > found.of_places - BY_CHANCE:
+            chain, found, first = unbroken, drifting, drifting
     # a break found by unconfirmed loops is not confirmed either
     for one, other in [(chain, found)] if found is first else [(chain, found), (unbroken, first)]:
         if not other.confirmed or by.is_crumpled(other):

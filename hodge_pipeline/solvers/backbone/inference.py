@@ -102,7 +102,7 @@ class LoopJudge:
         """
         found = self._best(chain, learned_scales(chain, self.outliers) if scales is None else [(scales, EVEN)])
         if scales is None and found is not None and not found.confirmed and chain.stated:
-            other = self._best(chain, learned_scales(chain, self.outliers, DRIFTING))
+            other = self.drifting(chain)
             if other is not None and other.confirmed and other.of_places > MISTAKEN + BY_CHANCE:
                 found = other
         for _ in range(MOST_ANEW if scales is None else 0):
@@ -116,6 +116,10 @@ class LoopJudge:
                 break
             found = other
         return found
+
+    def drifting(self, chain: Chain) -> Inferred | None:
+        """The loops judged where steps may turn wrongly by more than they shift."""
+        return self._best(chain, learned_scales(chain, self.outliers, DRIFTING))
 
     def _best(self, chain: Chain, learned: Iterable[tuple[Scales, Floats]]) -> Inferred | None:
         """The loops judged by the best of these scales, each with shares (2,) of right and wrong ones."""
