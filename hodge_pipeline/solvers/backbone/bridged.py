@@ -66,6 +66,8 @@ def infer_bridged(
     first = by.infer(chain)
     if first is None:
         return None
+    if not first.confirmed:
+        first = by.drifting(chain, MISTAKEN + BY_CHANCE) or first
     found = _without_shared_shifts(chain, judged(chain, first), by)
     parted = without_bias(chain.parted(), first.scales)  # bridges between paths lead as biased steps do
     if parted is None:
@@ -94,9 +96,9 @@ def _bridged(unbroken: Chain, first: Inferred, by: LoopJudge, most: int) -> tupl
             break
         chain, found = better
         as_stated = _as_stated(chain, found, by)
-    if chain is not unbroken and found.scales.steps_surprise:  # turns that drift one way for long look like a break
-        drifting = by.drifting(unbroken)
-        if drifting is not None and drifting.confirmed and drifting.of_places > found.of_places - BY_CHANCE:
+    if chain is not unbroken and found.scales.steps_surprise:  # turns that drift one way look like a break
+        drifting = by.drifting(unbroken, found.of_places - BY_CHANCE)
+        if drifting is not None:
             chain, found, first = unbroken, drifting, drifting
     # a break found by unconfirmed loops is not confirmed either
     for one, other in [(chain, found)] if found is first else [(chain, found), (unbroken, first)]:

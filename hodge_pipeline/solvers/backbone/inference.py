@@ -97,14 +97,9 @@ class LoopJudge:
 
         `scales`: of the errors; by default those learned from the loops by which their places are likelier, and learned
         anew at the poses that they lead to where the drift of a long path had hidden how loops err: where scales there
-        differ much, other loops agree by them, and the places are likelier. Where nothing is confirmed, steps may turn
-        wrongly by more than they shift: for long one way, as a gyroscope drifts.
+        differ much, other loops agree by them, and the places are likelier.
         """
         found = self._best(chain, learned_scales(chain, self.outliers) if scales is None else [(scales, EVEN)])
-        if scales is None and found is not None and not found.confirmed and chain.stated:
-            other = self.drifting(chain)
-            if other is not None and other.confirmed and other.of_places > MISTAKEN + BY_CHANCE:
-                found = other
         for _ in range(MOST_ANEW if scales is None else 0):
             if found is None or not found.confirmed:
                 break
@@ -117,9 +112,12 @@ class LoopJudge:
             found = other
         return found
 
-    def drifting(self, chain: Chain) -> Inferred | None:
-        """The loops judged where steps may turn wrongly by more than they shift."""
-        return self._best(chain, learned_scales(chain, self.outliers, DRIFTING))
+    def drifting(self, chain: Chain, least: float) -> Inferred | None:
+        """The loops judged where steps may turn wrongly by more than they shift, since a gyroscope drifts for long one
+        way; None where stated errors say nothing, or the log-odds of the places are not above `least`.
+        """
+        found = self._best(chain, learned_scales(chain, self.outliers, DRIFTING)) if chain.stated else None
+        return found if found is not None and found.confirmed and found.of_places > least else None
 
     def _best(self, chain: Chain, learned: Iterable[tuple[Scales, Floats]]) -> Inferred | None:
         """The loops judged by the best of these scales, each with shares (2,) of right and wrong ones."""
