@@ -68,6 +68,8 @@ def infer_bridged(
         return None
     if not first.confirmed:
         first = by.drifting(chain, MISTAKEN + BY_CHANCE) or first
+    if not first.confirmed:
+        first = by.drifting(chain, MISTAKEN + BY_CHANCE) or first
     found = _without_shared_shifts(chain, judged(chain, first), by)
     parted = without_bias(chain.parted(), first.scales)  # bridges between paths lead as biased steps do
     if parted is None:
@@ -98,7 +100,7 @@ def _bridged(unbroken: Chain, first: Inferred, by: LoopJudge, most: int) -> tupl
         as_stated = _as_stated(chain, found, by)
     if chain is not unbroken and found.scales.steps_surprise:  # turns that drift one way look like a break
         drifting = by.drifting(unbroken, found.of_places - BY_CHANCE)
-        if drifting is not None:
+        if drifting is not None and drifting.used[found.used].all():
             chain, found, first = unbroken, drifting, drifting
     # a break found by unconfirmed loops is not confirmed either
     for one, other in [(chain, found)] if found is first else [(chain, found), (unbroken, first)]:
