@@ -67,9 +67,9 @@ def infer_bridged(
     if first is None:
         return None
     if not first.confirmed:
-        first = by.drifting(chain, MISTAKEN + BY_CHANCE) or first
+        first = by.drifting(chain) or first
     if not first.confirmed:
-        first = by.drifting(chain, MISTAKEN + BY_CHANCE) or first
+        first = by.drifting(chain) or first
     found = _without_shared_shifts(chain, judged(chain, first), by)
     parted = without_bias(chain.parted(), first.scales)  # bridges between paths lead as biased steps do
     if parted is None:
@@ -98,10 +98,6 @@ def _bridged(unbroken: Chain, first: Inferred, by: LoopJudge, most: int) -> tupl
             break
         chain, found = better
         as_stated = _as_stated(chain, found, by)
-    if chain is not unbroken and found.scales.steps_surprise:  # turns that drift one way look like a break
-        drifting = by.drifting(unbroken, found.of_places - BY_CHANCE)
-        if drifting is not None and drifting.used[found.used].all():
-            chain, found, first = unbroken, drifting, drifting
     # a break found by unconfirmed loops is not confirmed either
     for one, other in [(chain, found)] if found is first else [(chain, found), (unbroken, first)]:
         if not other.confirmed or by.is_crumpled(other):

@@ -112,12 +112,12 @@ class LoopJudge:
             found = other
         return found
 
-    def drifting(self, chain: Chain, least: float) -> Inferred | None:
-        """The loops judged where steps may turn wrongly by more than they shift, since a gyroscope drifts for long one
-        way; None where stated errors say nothing, or the log-odds of the places are not above `least`.
+    def drifting(self, chain: Chain) -> Inferred | None:
+        """The loops judged where steps may turn wrongly by more than they shift, as a gyroscope drifts for long one
+        way; None where stated errors say nothing, or places are confirmed by no more than chance may add.
         """
         found = self._best(chain, learned_scales(chain, self.outliers, DRIFTING)) if chain.stated else None
-        return found if found is not None and found.confirmed and found.of_places > least else None
+        return found if found is not None and found.confirmed and found.of_places > MISTAKEN + BY_CHANCE else None
 
     def _best(self, chain: Chain, learned: Iterable[tuple[Scales, Floats]]) -> Inferred | None:
         """The loops judged by the best of these scales, each with shares (2,) of right and wrong ones."""
