@@ -144,7 +144,8 @@ def _without_shift(chain: Chain, found: Inferred, factor: float, by: LoopJudge) 
         return None
     if same.of_places < found.of_places + OF_A_SHIFT:
         return None
-    return apart, _judged_anew(apart, same, by), rows
+    again = _judged_anew(apart, same, by)
+    return apart, again if again.confirmed else same, rows
 
 
 def _judged_anew(chain: Chain, found: Inferred, by: LoopJudge) -> Inferred:
