@@ -9,19 +9,18 @@ from functools import cached_property
 import numpy as np
 from scipy.special import expit
 
-from hodge_pipeline.complex.chi2 import STUDENT_99
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.solvers.backbone.chain import Chain
-from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, EVEN, OutlierModel, mahalanobis, mixture
+from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, EVEN, OutlierModel, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, from_rotations, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, densities, judge
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.mistakes import Mistake, mistakes
 from hodge_pipeline.solvers.backbone.pairwise import likely_together
-from hodge_pipeline.solvers.backbone.places import MISTAKEN, Places, factors_by_chance
+from hodge_pipeline.solvers.backbone.places import MISTAKEN, Places
 from hodge_pipeline.solvers.backbone.polish import polished
-from hodge_pipeline.solvers.backbone.scales import DRIFTING, Scales, learned_scales
+from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
 from hodge_pipeline.types import Bools, Floats, Ints
 
 ROUNDS = 6
@@ -99,7 +98,7 @@ class LoopJudge:
         anew at the poses that they lead to where the drift of a long path had hidden how loops err: where scales there
         differ much, other loops agree by them, and the places are likelier.
         """
-        found = self._best(chain, learned_scales(chain, self.outliers) if scales is None else [(scales, EVEN)])
+        found = self.best(chain, learned_scales(chain, self.outliers) if scales is None else [(scales, EVEN)])
         for _ in range(MOST_ANEW if scales is None else 0):
             if found is None or not found.confirmed:
                 break
@@ -112,14 +111,7 @@ class LoopJudge:
             found = other
         return found
 
-    def drifting(self, chain: Chain) -> Inferred | None:
-        """The loops judged where steps may turn wrongly by more than they shift, as a gyroscope drifts for long one
-        way; None where stated errors say nothing, or places are confirmed by no more than chance may add.
-        """
-        found = self._best(chain, learned_scales(chain, self.outliers, DRIFTING)) if chain.stated else None
-        return found if found is not None and found.confirmed and found.of_places > MISTAKEN + BY_CHANCE else None
-
-    def _best(self, chain: Chain, learned: Iterable[tuple[Scales, Floats]]) -> Inferred | None:
+    def best(self, chain: Chain, learned: Iterable[tuple[Scales, Floats]]) -> Inferred | None:
         """The loops judged by the best of these scales, each with shares (2,) of right and wrong ones."""
         found: Inferred | None = None
         for given in learned:
@@ -147,30 +139,11 @@ class LoopJudge:
         reduced = thinned(found.start.chain, np.flatnonzero(self.trusted))
         return replace(found, used=self.trusted.copy(), linear=found.start, reduced=reduced, confirmed=False)
 
-    def is_crumpled(self, found: Inferred) -> bool:
-        """Whether loops bend the path, and agree with the poses between any other places too: a path that wrong ones
-        have folded, or bent from one mistaken place to the next, is small, and its places are near each other.
-        """
-        fit = Fit(found.reduced, found.linear)
-        chi2 = mahalanobis(*fit.left_out(fit.reduced.of_runs))[0]
-        if (chi2 > STUDENT_99[len(found.linear.chain.axes)]).sum() <= BENT * len(chi2):
-            return False
-        return bool((factors_by_chance(found.linear, self.outliers) > 0).mean() > ANYWHERE)
-
     def _others_agree(self, found: Inferred, chain: Chain) -> bool:
         """Whether by other errors, those of `chain`, other loops than the used ones agree with the poses found."""
         linear = replace(found.linear, chain=chain)
         judged = judge(linear, Fit(found.reduced, linear), EVEN, self.outliers)
         return bool(((_agreeing(judged) | self.trusted) != found.used).any())
-
-
-BENT, ANYWHERE = 0.02, 0.6
-"""Share of the runs of steps that are bent by more than 1 % of right ones; and share of random places between which
-loops agree, by the drift of the bare path. Beyond both, loops are wrong: .04 to .99 and .80 to .98 where all were wrong
-and used, in three graphs of the literature and seven simulated ones. Right ones: up to .26 of random places in 13
-graphs of the literature with as many wrong ones, .45 in MIT, whose odometry is off by 84 m; .72, with .01 of the runs
-bent, where it turns wrongly by 6° a step.
-"""
 
 
 MOST_ANEW = 3
