@@ -18,7 +18,7 @@ from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.mistakes import Mistake, mistakes
 from hodge_pipeline.solvers.backbone.pairwise import likely_together
-from hodge_pipeline.solvers.backbone.places import MISTAKEN, Places
+from hodge_pipeline.solvers.backbone.places import MISTAKEN, Places, likeliest_place
 from hodge_pipeline.solvers.backbone.polish import polished
 from hodge_pipeline.solvers.backbone.scales import Scales, learned_scales
 from hodge_pipeline.types import Bools, Floats, Ints
@@ -201,19 +201,21 @@ class _Trial:
             )
 
     def inferred(self) -> Inferred:
-        """The loops judged at the poses of the right ones. Where many that stand out on the bare chain are not used in
-        the end, these are grown by halves too, and the places decide that are likelier together: evidence of single
-        loops counts a mistake as often as it is repeated.
+        """The loops judged at the poses of the right ones, the likeliest by their places of what these lead to: loops
+        that stand out on the bare chain; if they are not confirmed, those of the likeliest place, which may say too
+        little to stand out among many wrong ones, though these do not agree; and where many that stand out are not used
+        in the end, these by halves: evidence of single loops counts a mistake as often as it is repeated.
         """
         out = self.standing_out
         at_once = self.grown(out, self.start, self.shares)
-        found = self.settled(*at_once)
-        if (out & ~found.used).sum() <= REFUSED * out.sum():
-            return found
-        by_halves = self.halves_grown(np.flatnonzero(out))
-        if (by_halves[0] == at_once[0] & out).all():
-            return found
-        return max(found, self.settled(*self.grown(*by_halves)), key=lambda each: each.rank)
+        founds = [self.settled(*at_once)]
+        if not founds[0].confirmed and (place := likeliest_place(self.start, self.alone)).any():
+            founds.append(self.settled(*self.grown(place | self.by.trusted, self.start, self.shares)))
+        if (out & ~founds[0].used).sum() > REFUSED * out.sum():
+            by_halves = self.halves_grown(np.flatnonzero(out))
+            if (by_halves[0] != at_once[0] & out).any():
+                founds.append(self.settled(*self.grown(*by_halves)))
+        return max(founds, key=lambda each: each.rank)
 
     @property
     def standing_out(self) -> Bools:

@@ -167,6 +167,21 @@ class Places:
         return [found.right & (np.arange(len(self.loop)) != place) for place in doubtful]
 
 
+def likeliest_place(start: Linear, alone: Judged) -> Bools:
+    """The loops (M,) of one place, more than `PAIRED` that agree, which is likeliest by the bare chain where other
+    groups of at least as many are its rivals.
+    """
+    groups = agreeing_groups(PairwiseConsistency.of(start, alone.log_wrong), np.arange(len(alone.factor)))
+    sizes = np.sort([len(each) for each in groups])
+    best, place = 0.0, np.zeros(0, np.int64)
+    for each in groups:
+        rivals = len(sizes) - np.searchsorted(sizes, len(each)) - 1 + MISTAKEN_PLACES
+        log_odds = float(np.median(alone.factor[each]) - np.log(rivals))
+        if len(each) > PAIRED and log_odds > best:
+            best, place = log_odds, each
+    return np.isin(np.arange(len(alone.factor)), place)
+
+
 def factors_by_chance(linear: Linear, outliers: OutlierModel) -> Floats:
     """Log Bayes factors (K,) that the motions of loops have between random places of a chain, along its path."""
     chain = linear.chain
