@@ -10,9 +10,10 @@ import pytest
 from backbone_graphs import Drive, drive
 from hodge_pipeline.diagnosis.diagnosis import backbone_or_diagnosis, diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.diagnosis.robust import degrees_of_freedom, solve_robust
+from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.solvers.covariance import relative_covariances
 from hodge_pipeline.solvers.editing import GraphEditor
+from hodge_pipeline.solvers.explained import degrees_of_freedom
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.types import Bools, ViewGraph
 from solver_graphs import ladder

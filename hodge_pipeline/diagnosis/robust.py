@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeAlias
@@ -21,12 +20,12 @@ from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, backbone_or_diagnosis, 
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.robust_priors import excess_of_priors, left_out_note, right_priors
-from hodge_pipeline.solvers.backbone.levels import SIGMAS
 from hodge_pipeline.solvers.backbone.trust import Backbone
+from hodge_pipeline.solvers.explained import is_explained
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.reweighted import reweighted
 from hodge_pipeline.solvers.setup import check_choice, held_rows
-from hodge_pipeline.solvers.weights import PLANAR_AXES, dimension_of, edge_weights, measured_axes
+from hodge_pipeline.solvers.weights import dimension_of, edge_weights
 from hodge_pipeline.types import Bools, Floats, Solution, ViewGraph
 from hodge_pipeline.types.text import counted
 
@@ -124,27 +123,6 @@ def _without_backbone(graph: ViewGraph, found: Diagnosis, solved: Solver) -> Sol
     earlier = (*stated.notes, _kept_note(found, whole), *found.notes)
     notes = (*(note for note in earlier if note not in final.notes), *final.notes)
     return _with_confirmation(graph, stated.used, replace(final, weights=whole, notes=notes))
-
-
-def is_explained(graph: ViewGraph, solution: Solution) -> bool:
-    """Whether the χ² of the maximum-likelihood solution of all edges agrees with its degrees of freedom; False where
-    the information is the identity that stands for unknown. Its standard deviation is √(2 degrees of freedom).
-    """
-    if has_unit_information(graph):
-        return False
-    freedom = degrees_of_freedom(graph, solution)
-    return freedom <= 0 or solution.metrics["objective"] <= freedom + SIGMAS * math.sqrt(2 * freedom)
-
-
-def degrees_of_freedom(graph: ViewGraph, solution: Solution) -> int:
-    """How many more numbers edges and priors state than the poses of their solution have."""
-    axes = PLANAR_AXES if dimension_of(graph) == 2 else np.arange(6)
-    stated = int(measured_axes(graph.information[:, axes[:, None], axes]).sum())
-    with_prior = np.zeros(0, np.int64) if graph.priors is None else graph.priors.vertices
-    free = np.ones(int(solution.component.max(initial=-1)) + 1, np.int64)  # gauge: one pose of each component
-    free[solution.component[with_prior]] = 0
-    held = np.maximum(np.bincount(solution.component[graph.fixed], minlength=len(free)), free).sum()
-    return stated + len(axes) * int(len(with_prior) - graph.vertex_count + held)
 
 
 def _placed(graph: ViewGraph, poses: Floats, start: Floats | None) -> Floats:

@@ -16,7 +16,7 @@ from hodge_pipeline.complex.chi2 import has_unit_information
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.conventions import inverted_notes
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
-from hodge_pipeline.diagnosis.robust import degrees_of_freedom, solve_robust
+from hodge_pipeline.diagnosis.robust import solve_robust
 from hodge_pipeline.diagnosis.robust_priors import MOST_EXCESS
 from hodge_pipeline.errors import GraphError, SourceError, WorkspaceError
 from hodge_pipeline.pairs.edits import joining
@@ -24,6 +24,7 @@ from hodge_pipeline.recipe.recipe_file import recipe_names
 from hodge_pipeline.solvers.backbone.credible import credible_steps
 from hodge_pipeline.solvers.backbone.sequence import sequential_edges
 from hodge_pipeline.solvers.backbone.trust import AUTO
+from hodge_pipeline.solvers.explained import degrees_of_freedom
 from hodge_pipeline.solvers.maximum_likelihood import ObjectiveName, solve
 from hodge_pipeline.solvers.setup import InitialName
 from hodge_pipeline.sources.inspect import guess_reader

@@ -99,6 +99,8 @@ class LoopJudge:
         differ much, other loops agree by them, and the places are likelier.
         """
         found = self.best(chain, learned_scales(chain, self.outliers) if scales is None else [(scales, EVEN)])
+        if scales is None and found is not None and not found.confirmed:
+            found = self._by_likeliest_place(chain, found)
         for _ in range(MOST_ANEW if scales is None else 0):
             if found is None or not found.confirmed:
                 break
@@ -110,6 +112,15 @@ class LoopJudge:
                 break
             found = other
         return found
+
+    def _by_likeliest_place(self, chain: Chain, found: Inferred) -> Inferred:
+        """The loops judged at the poses that those of one place lead to, or as `found` where that is likelier: each may
+        say less than some of many wrong ones reach by chance, but wrong ones seldom agree.
+        """
+        trial = _Trial.of(chain, self, found.scales, EVEN)
+        place = likeliest_place(trial.start, trial.alone)
+        other = trial.found(place) if place.any() else None
+        return found if other is None or other.rank <= found.rank else other
 
     def best(self, chain: Chain, learned: Iterable[tuple[Scales, Floats]]) -> Inferred | None:
         """The loops judged by the best of these scales, each with shares (2,) of right and wrong ones."""
@@ -188,10 +199,14 @@ class _Trial:
         start = linearise(chain, chain.poses)
         return cls(start, judge(start, None, shares, by.outliers), shares, by, scales)
 
-    def found(self) -> Inferred | None:
-        """What is `inferred`, or that nothing is used where nothing can be computed; None as in `infer`."""
+    def found(self, place: Bools | None = None) -> Inferred | None:
+        """What is `inferred`, or where the loops of one place (M,) lead to, or that nothing is used where nothing can
+        be computed; None as in `infer`.
+        """
         try:
-            return self.inferred()
+            if place is None:
+                return self.inferred()
+            return self.settled(*self.grown(place | self.by.trusted, self.start, self.shares))
         except _TooManyLoops:
             return None
         except np.linalg.LinAlgError:  # loops tear paths so far apart that covariances are lost in rounding
@@ -201,21 +216,19 @@ class _Trial:
             )
 
     def inferred(self) -> Inferred:
-        """The loops judged at the poses of the right ones, the likeliest by their places of what these lead to: loops
-        that stand out on the bare chain; if they are not confirmed, those of the likeliest place, which may say too
-        little to stand out among many wrong ones, though these do not agree; and where many that stand out are not used
-        in the end, these by halves: evidence of single loops counts a mistake as often as it is repeated.
+        """The loops judged at the poses of the right ones. Where many that stand out on the bare chain are not used in
+        the end, these are grown by halves too, and the places decide that are likelier together: evidence of single
+        loops counts a mistake as often as it is repeated.
         """
         out = self.standing_out
         at_once = self.grown(out, self.start, self.shares)
-        founds = [self.settled(*at_once)]
-        if not founds[0].confirmed and (place := likeliest_place(self.start, self.alone)).any():
-            founds.append(self.settled(*self.grown(place | self.by.trusted, self.start, self.shares)))
-        if (out & ~founds[0].used).sum() > REFUSED * out.sum():
-            by_halves = self.halves_grown(np.flatnonzero(out))
-            if (by_halves[0] != at_once[0] & out).any():
-                founds.append(self.settled(*self.grown(*by_halves)))
-        return max(founds, key=lambda each: each.rank)
+        found = self.settled(*at_once)
+        if (out & ~found.used).sum() <= REFUSED * out.sum():
+            return found
+        by_halves = self.halves_grown(np.flatnonzero(out))
+        if (by_halves[0] == at_once[0] & out).all():
+            return found
+        return max(found, self.settled(*self.grown(*by_halves)), key=lambda each: each.rank)
 
     @property
     def standing_out(self) -> Bools:

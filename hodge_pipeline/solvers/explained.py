@@ -1,0 +1,33 @@
+"""Whether the information of a graph's edges explains what their maximum-likelihood solution leaves over."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hodge_pipeline.complex.chi2 import has_unit_information
+from hodge_pipeline.solvers.backbone.levels import SIGMAS
+from hodge_pipeline.solvers.weights import PLANAR_AXES, dimension_of, measured_axes
+from hodge_pipeline.types import Solution, ViewGraph
+
+
+def is_explained(graph: ViewGraph, solution: Solution) -> bool:
+    """Whether the χ² of the maximum-likelihood solution of all edges agrees with its degrees of freedom; False where
+    the information is the identity that stands for unknown. Its standard deviation is √(2 degrees of freedom).
+    """
+    if has_unit_information(graph):
+        return False
+    freedom = degrees_of_freedom(graph, solution)
+    return freedom <= 0 or solution.metrics["objective"] <= freedom + SIGMAS * math.sqrt(2 * freedom)
+
+
+def degrees_of_freedom(graph: ViewGraph, solution: Solution) -> int:
+    """How many more numbers edges and priors state than the poses of their solution have."""
+    axes = PLANAR_AXES if dimension_of(graph) == 2 else np.arange(6)
+    stated = int(measured_axes(graph.information[:, axes[:, None], axes]).sum())
+    with_prior = np.zeros(0, np.int64) if graph.priors is None else graph.priors.vertices
+    free = np.ones(int(solution.component.max(initial=-1)) + 1, np.int64)  # gauge: one pose of each component
+    free[solution.component[with_prior]] = 0
+    held = np.maximum(np.bincount(solution.component[graph.fixed], minlength=len(free)), free).sum()
+    return stated + len(axes) * int(len(with_prior) - graph.vertex_count + held)
