@@ -11,6 +11,7 @@
     python -m benchmarks.wrong_loops alike --seed 1      # storeys, decks and rows taken for the next
     python -m benchmarks.wrong_loops biased --seed 1     # odometry that turns too far at each step
     python -m benchmarks.wrong_loops drifting --seed 1   # and whose turns drift
+    python -m benchmarks.wrong_loops closing --seed 1    # rings that close at one place, wrong loops as in Vertigo
     python -m benchmarks.wrong_loops lattices --seed 1   # cylinders and grids with 1 to 20 % of all edges wrong
     python -m benchmarks.wrong_loops windows --seed 1    # walks with edges over two steps to ten: a sliding window
     python -m benchmarks.wrong_loops sessions --seed 1   # walks cut into two to five sessions that loops alone join
@@ -33,6 +34,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from alike_worlds import alike_cases
 from biased_worlds import biased_cases, drifting_cases
+from closing_worlds import closing_cases
 from edges_peers import consecutive as steps
 from slam_loops import odometry, position_error
 from spoilt_graphs import KINDS, Case
@@ -48,7 +50,8 @@ MORE = 1.02
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    kinds = {**KINDS, "alike": alike_cases, "biased": biased_cases, "drifting": drifting_cases}
+    more = {"alike": alike_cases, "biased": biased_cases, "drifting": drifting_cases, "closing": closing_cases}
+    kinds = {**KINDS, **more}
     parser.add_argument("kind", choices=kinds)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="graphs whose name has this word")

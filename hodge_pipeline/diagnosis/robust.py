@@ -16,7 +16,7 @@ from hodge_pipeline.complex.chi2 import has_unit_information
 from hodge_pipeline.complex.closing import closes_better_than_chance
 from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.cycles import is_folded
-from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, backbone_or_diagnosis, informed, kept_graph
+from hodge_pipeline.diagnosis.diagnosis import DEFAULTS, backbone_or_diagnosis, errs_as_stated, informed, kept_graph
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import SUSPECT, WRONG, Diagnosis
 from hodge_pipeline.diagnosis.robust_priors import excess_of_priors, left_out_note, right_priors
@@ -90,7 +90,7 @@ def _on_backbone(graph: ViewGraph, backbone: Backbone, solved: Solver) -> Soluti
     """
     chosen = informed(graph, backbone).select(np.flatnonzero(backbone.used))
     final = solved(chosen, backbone.world_from_cam) if backbone.chain.stated else None
-    if final is None or not is_explained(chosen, final):
+    if final is None or not errs_as_stated(graph, backbone, chosen, final):
         final = solved(backbone.weighted(graph), backbone.world_from_cam)
     weights = np.zeros(graph.edge_count)
     weights[backbone.used] = final.weights

@@ -74,14 +74,18 @@ def infer_bridged(
     if first is None:
         return None
     found = _without_shared_shifts(chain, judged(chain, first), by)
-    parted = without_bias(chain.parted(), first.scales)  # bridges between paths lead as biased steps do
-    if parted is None:
+    parted = chain.parted()  # bridges between paths lead as biased steps do
+    told = without_bias(parted, first.scales)
+    if told is None:
         return found
-    unbiased = joined(parted)
+    unbiased = joined(told)
     second = by.infer(unbiased)
     if second is None:
         return found
     (apart, other), (chain, before) = judged(unbiased, second), found
+    rows = np.flatnonzero(other.used)
+    if without_bias(parted.with_loops(rows, parted.ends[rows]), first.scales) is None:  # told by loops that are refused
+        return found
     likelier = other.of_places > before.of_places + BY_CHANCE * len(unbiased.bias)
     if apart.broken.sum() > chain.broken.sum():  # breaks may only mend what the wrong bias did
         likelier = likelier and other.log_evidence > before.log_evidence

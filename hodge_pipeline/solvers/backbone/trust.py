@@ -82,18 +82,20 @@ class Backbone:
     vertex_ids: NDArray[Any]
     named: str = "consecutive edges"
 
-    def weighted(self, graph: ViewGraph) -> ViewGraph:
-        """The graph of the used edges, with information scaled to the errors that were learned, and without bias."""
+    def weighted(self, graph: ViewGraph, *, correlated: bool = True) -> ViewGraph:
+        """The graph of the used edges, with information scaled to the errors that were learned, and without bias;
+        `correlated`: as the last solve takes them, else as independent.
+        """
         step, loop = self.found.scales.units(self.chain)
         width = np.ones((graph.edge_count, len(self.chain.axes)))
-        width[self.steps] = step * LOCAL
+        width[self.steps] = step * (LOCAL if correlated else 1.0)
         unit = has_unit_information(graph)
         if unit:  # n measurements of a step, or one over g steps, weigh as much less each
             spans = self.chain.spans(graph.edges[self.steps])
             times = np.median(self.chain.over(spans)[self.chain.step_edge >= 0])
             width[self.steps] *= np.sqrt(times * np.diff(spans, axis=1))
         graph, _ = credible_steps(self.unbiased(graph), self.steps)
-        width[self.chain.loop_edge] = loop * self.loop_width[:, None]
+        width[self.chain.loop_edge] = loop * (self.loop_width[:, None] if correlated else 1.0)
         whole = np.ones((graph.edge_count, 6))
         whole[:, self.chain.axes] = width
         information = graph.information / (whole[:, :, None] * whole[:, None, :])
