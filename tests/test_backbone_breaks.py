@@ -45,7 +45,7 @@ def test_a_broken_step_is_named_and_no_other(world: str, dimension: int, count: 
     found = diagnose(broken(made, step))
     assert np.flatnonzero(found.verdict[: count - 1] == "wrong").tolist() == [step]
     assert "confirmed loops over it contradict" in found.reason[step]
-    assert made.error_m(found.world_from_cam) < 1.1 * made.error_m(diagnose(made.graph).world_from_cam)
+    assert made.error_m(found.world_from_cam) < 1.2 * made.error_m(diagnose(made.graph).world_from_cam)
 
 
 HIDDEN = [

@@ -116,7 +116,7 @@ def test_loops_that_nothing_can_be_computed_with_confirm_nothing(monkeypatch: py
         raise np.linalg.LinAlgError("Matrix is not positive definite")
 
     made = drive()
-    monkeypatch.setattr(inference._Trial, "inferred", fails)
+    monkeypatch.setattr(inference._Trial, "settled", fails)
     found = diagnose(made.graph, DiagnosisOptions(trust="sequential"))
     assert not found.kept[399:].any() and found.kept[:399].all()
     assert made.error_m(found.world_from_cam) == pytest.approx(made.error_m(made.odometry()))
