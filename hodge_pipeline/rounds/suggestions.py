@@ -98,8 +98,8 @@ def _missing_sides(edges: Ints, count: int) -> Ints:
 def _near(diagnosis: Diagnosis) -> Ints:
     """Each view with its nearest ones in the same piece."""
     parts = [np.zeros((0, 2), np.int64)]
-    for piece in range(int(diagnosis.piece.max(initial=-1)) + 1):
-        rows = np.flatnonzero(diagnosis.piece == piece)
+    by_piece = np.argsort(diagnosis.piece, kind="stable")
+    for rows in np.split(by_piece, np.bincount(diagnosis.piece).cumsum()[:-1]):
         if len(rows) < 2:
             break  # pieces come by size
         number = min(NEAREST + 1, len(rows))
