@@ -12,6 +12,8 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
+from hodge_pipeline.interrupts import delayed_interrupts
+
 _PLOTLY = "open3d.visualization.draw_plotly"
 
 
@@ -45,7 +47,7 @@ def _left_out(module: str) -> Iterator[None]:
         del sys.modules[module]
 
 
-with _left_out(_PLOTLY):
+with delayed_interrupts(), _left_out(_PLOTLY):  # stopped while it starts, it prints pages of memory statistics
     import open3d as o3d
 
 __all__ = ["o3d"]

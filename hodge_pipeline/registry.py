@@ -105,7 +105,7 @@ def load(kind: str, name: str) -> Any:
     try:
         return known[name].load()
     except Exception as error:  # a plugin can fail in any way
-        _give_way_to_ctrl_c(error)
+        give_way_to_ctrl_c(error)
         reason = f"{type(error).__name__}: {error}"
         ours = isinstance(error, ImportError) and origin(kind, name).startswith(OURS)
         raise RecipeError(
@@ -114,7 +114,7 @@ def load(kind: str, name: str) -> Any:
         ) from error
 
 
-def _give_way_to_ctrl_c(error: BaseException) -> None:
+def give_way_to_ctrl_c(error: BaseException) -> None:
     """Raise the `KeyboardInterrupt` that a compiled module, stopped while it was imported, tells as an ImportError."""
     cause: BaseException | None = error
     while cause is not None:

@@ -18,7 +18,7 @@ FAR = np.array([431_000.0, 5_401_000.0, 120.0])
 def write_las(path: Path, points: np.ndarray, bits: int = 16, times_s: float | np.ndarray = 0.0) -> Path:
     laspy = pytest.importorskip("laspy", reason="laspy is not installed: pip install 'hodge-pipeline[scans]'")
     header = laspy.LasHeader(point_format=3, version="1.2")
-    header.scales, header.offsets = np.full(3, 1e-4), points.min(axis=0)
+    header.scales, header.offsets = np.full(3, 1e-4), points.min(axis=0, initial=FAR.max())
     las = laspy.LasData(header)
     las.x, las.y, las.z = points.T
     las.red = las.green = np.full(len(points), 200 * (257 if bits == 16 else 1))

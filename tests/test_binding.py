@@ -84,6 +84,7 @@ def test_a_stage_by_name_has_its_defaults(tmp_path: Path) -> None:
         ),
         ("seed: -1\n", "r.yaml:6: seed: expected a whole number from 0, got -1"),
         ("source: {path: [a, b]}\n", "r.yaml:6: source.path: expected a path, got ['a', 'b']"),
+        ("fusion: none\n", "r.yaml:6: fusion: expected a list, got 'none'"),
         (
             "suggestions: {among: {stage: combined, builders: []}}\n",
             "suggestions.among.builders: expected more items, got ()",

@@ -15,7 +15,7 @@ from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.result import UNTESTABLE, WRONG
 from hodge_pipeline.diagnosis.robust import RobustSolver
 from hodge_pipeline.rounds.one_round import Registered, judge_edges, solve_edges
-from hodge_pipeline.rounds.suggestions import suggest_pairs
+from hodge_pipeline.rounds.suggestions import NEIGHBOURS_APART, _missing_sides, suggest_pairs
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.poisson import PoissonSolver
 from hodge_pipeline.stages import ConsistencySolver, Step, no_progress
@@ -77,6 +77,17 @@ def test_the_missing_side_of_two_untestable_edges_is_suggested_first() -> None:
     assert suggestions.resistance[0] == 2 and "tests 2 untestable edges" in suggestions.reason[0]
     joined = {tuple(sorted(edge)) for edge in graph.edges.tolist()}
     assert not joined & {tuple(pair) for pair in suggestions.pairs.tolist()}
+
+
+def test_missing_sides_of_triangles_are_all_of_a_usual_graph_and_few_of_a_view_that_sees_all() -> None:
+    """Pairs of 50,000 neighbours of one view filled 24 GB."""
+    edges = np.array([[0, 3], [3, 1], [1, 0], [4, 3], [2, 4], [2, 2]])
+    joined = np.zeros((5, 5), int)
+    joined[tuple(edges.T)] = joined[tuple(edges.T[::-1])] = 1
+    brute = {(i, j) for i in range(5) for j in range(i + 1, 5) if joined[i] @ joined[j]}
+    assert {tuple(pair) for pair in _missing_sides(edges, 5).tolist()} == brute
+    hub = np.stack([np.zeros(1000, int), np.arange(1, 1001)], axis=1)
+    assert 0 < len(_missing_sides(hub, 1001)) <= NEIGHBOURS_APART * 1000
 
 
 def test_an_edge_that_is_added_takes_its_suggestion_away_and_the_ends_of_a_loop_come_first() -> None:

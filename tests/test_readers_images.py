@@ -37,6 +37,18 @@ def test_colour_is_rgb(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_allclose(colour[2, 3], [200, 100, 50], atol=2)
 
 
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_the_orientation_that_an_exif_block_names_turns_no_pixels(tmp_path: Path, suffix: str) -> None:
+    """Intrinsics count pixels as they are stored; those that OpenCV turned were then stretched to the camera's size."""
+    path, exif = tmp_path / f"phone{suffix}", Image.Exif()
+    exif[0x112] = 6  # orientation: the right-hand side is the top
+    stored = np.zeros((20, 30, 3), np.uint8)
+    stored[:10] = 255
+    Image.fromarray(stored).save(path, exif=exif, quality=100)
+    read = pixels.read_colour(path, size=(30, 20))
+    np.testing.assert_allclose(read.astype(int), stored, atol=40)
+
+
 def test_encoded_images_are_the_bytes_of_the_file(tmp_path: Path) -> None:
     depth, colour = write_depth(tmp_path / "d.png", depth_values()), write_colour(tmp_path / "c.jpg")
     encoded = pixels.encoded(depth, units_per_metre=5000.0)

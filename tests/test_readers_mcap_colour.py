@@ -1,10 +1,12 @@
 """Colour of a recording that is of another camera than its depth, as a RealSense gives where it does not align them."""
 
+import io
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from hodge_adapters.mcap.reader import McapReader
 from hodge_pipeline import se3
@@ -71,3 +73,18 @@ def test_with_the_intrinsics_of_depth_it_is_registered(tmp_path: Path) -> None:
     source = McapReader().open(recording(tmp_path / "log.mcap", DEPTH_CAMERA))
     assert source.frames[0].read_colour is not None
     assert any("colour is off by as much" in note for note in source.notes)
+
+
+def test_a_phones_jpeg_is_read_as_it_is_stored(tmp_path: Path) -> None:
+    """Its EXIF block names an orientation, by which OpenCV turned it: it was said not to be decoded."""
+    exif, coded, log = Image.Exif(), io.BytesIO(), Log()
+    exif[0x112] = 6  # the right-hand side is the top
+    picture = np.repeat(np.uint8([[[0]], [[255]]]), 24, axis=0).repeat(64, axis=1).repeat(3, axis=2)
+    Image.fromarray(picture).save(coded, "jpeg", exif=exif, quality=100)
+    head, (wide, high) = foxglove_header(100, "cam"), (DEPTH_CAMERA.width, DEPTH_CAMERA.height)
+    log.add("/info", "foxglove.CameraCalibration", {**head, **calibration(wide, high, 50, 50, 31.5, 23.5)}, CDR)
+    log.add("/depth", "foxglove.RawImage", {**head, **raw_image(np.full((high, wide), 1000, np.uint16), "16UC1")}, CDR)
+    log.add("/colour", "foxglove.CompressedImage", {**head, "format": "jpeg", "data": coded.getvalue()}, CDR)
+    (frame,) = McapReader().open(log.write(tmp_path / "phone.mcap")).frames
+    assert frame.read_colour is not None
+    np.testing.assert_allclose(frame.read_colour().astype(int), picture, atol=40)

@@ -157,7 +157,10 @@ def test_damage_in_the_middle_costs_one_chunk(tmp_path: Path) -> None:
     flipped = contents.copy()
     flipped[chunks[20] + 60] ^= 0x10
     path.write_bytes(flipped)
-    assert any("log.mcap: 1 left out: a chunk" in note for note in McapReader().open(path).notes)
+    flipped_source = McapReader().open(path)
+    assert any("log.mcap: 1 left out: a chunk" in note for note in flipped_source.notes)
+    assert not whole.doubts
+    assert [(doubt.kind, doubt.count) for doubt in flipped_source.doubts] == [("recording incomplete", 1)]
     longer = contents.copy()
     longer[chunks[20] + 6] = 0x7F  # The record's length, now past the end of the file.
     path.write_bytes(longer)

@@ -97,6 +97,15 @@ def test_a_line_that_is_no_pose_is_named_or_noted(tmp_path: Path, line: str) -> 
         parse_tum(path)
 
 
+def test_a_table_of_other_columns_is_told_how_many_it_has(tmp_path: Path) -> None:
+    """The first 80 characters of a line look like a pose where covariances follow it."""
+    (tmp_path / "a.tum").write_text(
+        "1305031102.160407 1.344379 0.627206 1.661754 0.658249 0.611043 -0.294444 -0.3265 1 2\n"
+    )
+    with pytest.raises(SourceError, match="of 10 columns is no pose: expected stamp tx"):
+        parse_tum(tmp_path / "a.tum")
+
+
 def test_unsorted_and_repeated_stamps_are_put_in_order_and_noted(tmp_path: Path) -> None:
     path = tmp_path / "a.tum"
     path.write_text("2 2 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n2 9 0 0 0 0 0 1\n")

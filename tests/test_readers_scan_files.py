@@ -27,6 +27,13 @@ def test_las_files_count_from_the_whole_metres_of_their_middle(tmp_path: Path) -
     assert source.notes == ("coordinates of 2 LAS files are counted from their middle 431006 5401002 121",)
 
 
+def test_an_empty_las_tile_does_not_move_the_corner_to_zero(tmp_path: Path) -> None:
+    write_las(tmp_path / "tile_0.las", FAR + ROOM)
+    write_las(tmp_path / "tile_1.las", np.zeros((0, 3)))
+    first, _ = CloudFolderReader().open(tmp_path).frames
+    np.testing.assert_allclose(first.read_points().points_in_cam, FAR + ROOM - [431_001, 5_401_002, 121], atol=2e-4)
+
+
 def test_las_sweeps_keep_the_scanners_axes_and_the_times_of_their_points(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -224,6 +224,15 @@ def test_frames_that_nothing_joins_do_not_flatter_the_error() -> None:
     assert (row.frames, row.left_out, row.degenerate) == (6, 2, False)
 
 
+def test_where_nothing_is_joined_no_error_is_measured(report: Report) -> None:
+    """Each frame, aligned by itself, fits its truth to the last bit."""
+    (row,) = trajectory_rows({"result": circle(3)}, circle(3), np.arange(3))
+    assert (row.frames, row.left_out) == (0, 3) and np.isnan(row.ate_rmse_m)
+    paths = tuple(replace(path, positions=report.pictures.paths[0].positions + 1e-16) for path in report.pictures.paths)
+    exact = replace(report, pictures=replace(report.pictures, paths=paths, names=tuple("abcdefghijklmnopqrst")))
+    assert not any("off the truth" in place for place in worst_places(replace(exact, trajectories=())))
+
+
 def test_tables_and_terminal_lines(report: Report) -> None:
     scores, trajectory = score_tables(report)
     assert scores.rows[1][:4] == ("odometry", "0.7486", "20.00 mm", "3")

@@ -1,5 +1,8 @@
 """What a review opens, what it refuses, and what can only be looked at."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -89,3 +92,16 @@ def test_a_run_that_stopped_half_way_can_only_be_looked_at(tiny_sequence: Path, 
         with pytest.raises(LockedError, match="not finished"):
             session.decide(0, "disable", [0])
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "run").rglob("*")} == before
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
+def test_a_review_that_is_asked_to_end_leaves_no_socket_behind(graph_file: Path, tmp_path: Path) -> None:  # noqa: F811
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'hodge-pipeline[review]'")
+    (temporary := tmp_path / "temporary").mkdir()
+    serve = [sys.executable, "-m", "hodge_pipeline.cli.main", "review", str(graph_file), "--no-browser"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": str(temporary)}
+    with subprocess.Popen(serve, stdout=subprocess.PIPE, text=True, env=environment) as process:
+        assert process.stdout is not None and process.stdout.readline().startswith("http://")
+        assert list(temporary.glob("hodge-review-*"))
+        process.terminate()
+    assert not list(temporary.glob("hodge-review-*"))

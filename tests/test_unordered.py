@@ -373,6 +373,12 @@ def test_where_no_two_scans_are_joined_the_report_says_what_to_do(pose: Floats |
     assert _none_joined(scene, edges, np.array([0, 0, 1])) == ()
 
 
+def test_where_no_pair_was_tried_nobody_is_asked_for_more_scans() -> None:
+    scene = Frames([Frame(row, float(row)) for row in range(3)], Path(), np.arange(3))
+    (note,) = _none_joined(scene, Edges.of(np.zeros((0, 2), int)), np.arange(3))
+    assert note.detail == "no pair was tried"
+
+
 @pytest.mark.parametrize("of_reflection, found", [(0.6, [2]), (0.12, [])], ids=["mirrored", "far off"])
 def test_a_scan_whose_reflection_fits_clearly_better_is_mirrored(
     of_reflection: float, found: list[int], tmp_path: Path

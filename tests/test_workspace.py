@@ -98,6 +98,22 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 1
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such files")
+def test_no_file_takes_the_place_of_a_device_or_a_pipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Root, as in a container, replaced /dev/null and the link /dev/stdout for every program of the machine."""
+    pipe, discarded, devices = tmp_path / "pipe", tmp_path / "discarded", tmp_path / "dev"
+    os.mkfifo(pipe)
+    discarded.symlink_to(os.devnull)
+    devices.mkdir()
+    (tmp_path / "output").write_text("printed")
+    (devices / "stdout").symlink_to(tmp_path / "output")
+    monkeypatch.setattr("hodge_pipeline.types.output_files.DEVICES", devices.resolve())
+    for path in (pipe, discarded, devices / "stdout"):
+        with pytest.raises(OSError, match="a device or pipe"), replacing(path) as file:
+            file.write(b"x")
+    assert pipe.is_fifo() and discarded.is_symlink() and (devices / "stdout").is_symlink()
+
+
 def test_numbers_that_json_lacks_become_null(tmp_path: Path) -> None:
     artifacts.write_json(tmp_path / "x.json", {"a": float("nan"), "b": np.array([1.0, np.inf]), "c": np.int64(3)})
     assert artifacts.read_json(tmp_path / "x.json") == {"a": None, "b": [1.0, None], "c": 3}

@@ -24,8 +24,9 @@ def one_line_errors() -> Iterator[None]:
     except ImportError as error:
         if (error.name or "").startswith("hodge"):
             raise
-        from hodge_pipeline.registry import LIBRARIES
+        from hodge_pipeline.registry import LIBRARIES, give_way_to_ctrl_c
 
+        give_way_to_ctrl_c(error)
         _end(f"a library does not load ({shown_error(error)}): {LIBRARIES}")
     except Exception as error:
         from hodge_pipeline.errors import HodgeError

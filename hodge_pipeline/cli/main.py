@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -250,6 +251,7 @@ def review(
     """See edges and their clouds on a page that only this machine can open, decide by hand, and watch the map mend."""
     from hodge_pipeline.review.opening import open_review
 
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # else its socket stays in the folder of temporary files
     with open_review(path, port=port, browser=browser) as opened:
         print(f"{opened.address}\nwhoever has this address can decide; Ctrl-C ends it", flush=True)
         opened.wait()

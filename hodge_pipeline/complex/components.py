@@ -41,10 +41,12 @@ def first_of_component(component: Ints) -> Bools:
 
 def apart_along_x(world_from_cam: Floats, component: Ints, space_m: float) -> Floats:
     """The poses (V, 4, 4), the components moved along x so that each begins `space_m` beside the one before it."""
-    out = np.array(world_from_cam, float)
-    for number in range(1, int(component.max(initial=-1)) + 1):
-        rows = component == number
-        out[rows, 0, 3] += out[component == number - 1, 0, 3].max() + space_m - out[rows, 0, 3].min()
+    out, count = np.array(world_from_cam, float), int(component.max(initial=-1)) + 1
+    low, high = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(low, component, out[:, 0, 3])
+    np.maximum.at(high, component, out[:, 0, 3])
+    begin = low[:1] + np.concatenate([np.zeros(1), np.cumsum(high - low + space_m)])[:count]
+    out[:, 0, 3] += (begin - low)[component]
     return out
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from multiprocessing.connection import wait as wait_for_end
 from types import ModuleType
 from typing import Any, TypeVar
@@ -20,6 +21,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_pipeline.errors import WorkerError
+from hodge_pipeline.interrupts import delayed_interrupts
 from hodge_pipeline.stages import Workers
 from hodge_pipeline.store.memory import keep_memory
 
@@ -118,8 +120,8 @@ class SpawnedWorkers:
                 )
 
     def _submit(self, task: Callable[[Task], Result], block: Task) -> Future[Result]:
-        # may start a process, which inherits the environment and the main module as they are now
-        with _environment(SINGLE_THREADED), _hidden_main():
+        # may start a process, which inherits the environment, the main module and blocked signals as they are now
+        with _environment(SINGLE_THREADED), _hidden_main(), delayed_interrupts(), _blocked_interrupts():
             if self._pool is None:
                 spawn = multiprocessing.get_context("spawn")
                 self._pool = ProcessPoolExecutor(self._count, mp_context=spawn, initializer=_begin_worker)
@@ -186,6 +188,20 @@ def _environment(values: dict[str, str]) -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+@contextmanager
+def _blocked_interrupts() -> Iterator[None]:
+    """Spawned children never get the Ctrl-C of their terminal, which would end them with a traceback as they start."""
+    if sys.platform == "win32":
+        yield
+        return
+    resource_tracker.ensure_running()  # whose start, at the first child, would unblock it
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

@@ -22,7 +22,7 @@ Where = Callable[[Keys], str]
 """Gives `file:line` of a path of keys."""
 WORDS = {float: "number", int: "whole number", bool: "true or false", str: "text", type(None): "nothing"}
 """Types in the words of an error."""
-IN_WORDS = {"path_type": "expected a path", "too_short": "expected more items"}
+IN_WORDS = {"path_type": "expected a path", "too_short": "expected more items", "tuple_type": "expected a list"}
 """What pydantic says of a wrong value in words of its own code, said in those of a recipe."""
 KIND = "x-stage-kind"
 """The key that marks a stage of a kind in a schema that is not linked yet."""

@@ -138,9 +138,9 @@ def _occupied(points: Floats, voxel_m: float) -> int:
 
 def _in_words(factor: float, voxel_m: float) -> str:
     """The detail of the note on a factor that was measured."""
-    size = "larger" if factor > 1 else "smaller"
+    size = "larger than a room, or sparser" if factor > 1 else "smaller than a room"
     text = (
-        f"the scans are {size} than a room: all lengths of the recipe are taken times {factor:g} (clouds.voxel_m is "
+        f"the scans are {size}: all lengths of the recipe are taken times {factor:g} (clouds.voxel_m is "
         f"{voxel_m * factor:.3g} m); scale=1 leaves them as they are"
     )
     unit = (

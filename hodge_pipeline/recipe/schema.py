@@ -41,7 +41,10 @@ from hodge_pipeline.store import yaml_file
 class SourceOptions:
     """What to read, and as what."""
 
-    path: Path | None = Field(default=None, description="a folder or file; `hodge run --source` sets it")
+    path: Path | None = Field(
+        default=None,
+        description="a folder or file, relative to where the command runs; `hodge run --source` sets it",
+    )
     reader: FrameReader | None = Field(
         default=None, description="its format; none: the reader that is surest of the path"
     )

@@ -43,9 +43,11 @@ def prepare_clouds(
     if not any(counts.valid for counts in every):
         reason = odd[0] if odd else "the source has no frames"
         raise no_clouds(frames, reason)
+    empty = [str(counts.odd) for counts in every if counts.odd is not None and not counts.valid]
     odd += [Oddity(frame.frame_id, BLANK) for frame, counts in zip(frames, every, strict=True) if counts.blank]
     of_other_units = _of_other_units(frames, np.array([counts.reach_m for counts in every]))
     return clouds, (
+        *([Note("no cloud", len(empty), empty[0])] if empty else []),
         *notes_of("clouds", shortened(odd)),
         *notes_of("other units", shortened(of_other_units)),
         *notes_of("clouds", _no_returns(every)),

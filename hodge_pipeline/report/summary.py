@@ -47,7 +47,7 @@ def trajectory_rows(
     parts = _distinct(component, sequence, len(truth))
     if component is not None:
         alone = np.bincount(component)[component] == 1
-        truth = truth if alone.all() else np.where(alone[:, None, None], np.nan, truth)
+        truth = np.where(alone[:, None, None], np.nan, truth)
     rows = []
     for name, poses in pose_sets.items():
         absolute = absolute_error(poses, truth, component)

@@ -12,7 +12,8 @@ from hodge_pipeline.report.verdict import capital
 from hodge_pipeline.types.text import command
 
 EXACT = 1e-9
-"""Metres and degrees: residuals below are those of arithmetic, as of edges that no loop passes (1e-17 to 1e-13)."""
+"""Metres and degrees: what is below is arithmetic, as of edges that no loop passes (1e-17 to 1e-13), or of frames that
+are each aligned by itself."""
 
 
 def peak(total: StageRow) -> str:
@@ -22,16 +23,15 @@ def peak(total: StageRow) -> str:
 
 def worst_places(report: Report) -> Iterator[str]:
     """The frame and the edge that are worst, a line each, where they were measured."""
-    errors = offsets(report).get(report.after)
+    errors = np.linalg.norm(offsets(report).get(report.after, np.zeros((0, 3))), axis=1)
     of_all = next((row for row in report.trajectories if row.name == report.after and row.worst), None)
     if of_all is not None and not report.shows_rejected:
         beside = max(row.ate_rmse_m for row in report.trajectories if row.frames)  # whose unit the table's ATEs have
         off = report.length(of_all.ate_max_m, beside)
         yield f"Frame {of_all.worst} lies {off} off the truth, more than any other."
-    elif errors is not None and len(report.pictures.names) == len(errors):
-        size = np.linalg.norm(errors, axis=1)
-        row = int(np.nanargmax(size))
-        name, off = f"{report.source.vertex} {report.pictures.names[row]}", report.length(float(size[row]))
+    elif len(report.pictures.names) == len(errors) and np.nanmax(errors, initial=0.0) > EXACT:
+        row = int(np.nanargmax(errors))
+        name, off = f"{report.source.vertex} {report.pictures.names[row]}", report.length(float(errors[row]))
         what = f"lies {off} off the truth" if has_truth(report) else f"was moved by {off}"
         where = "in the refinement, which is not kept, " if report.shows_rejected else ""
         yield capital(f"{where}{name} {what}, more than any other.")

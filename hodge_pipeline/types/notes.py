@@ -95,6 +95,8 @@ LOOKS = {
     "{count:it|them}",
     "no pose near": "the trajectory beside the {count} {count:frame|frames} has no pose near in time of any: is it of "
     "another clock?",
+    "no cloud": "{count} {count:frame gives|frames give} no cloud, and {count:joins|join} nothing by surfaces; the "
+    "first: {detail}",
     "images unread": "{count} {count:frame has an image|frames have images} that cannot be read {detail}",
     "repeated images": "{count} {count:frame repeats|frames repeat} the images of the frame before ({detail}), as "
     "where a camera stalls: {count:its pose is|their poses are} guessed from {count:its|their} neighbours'",

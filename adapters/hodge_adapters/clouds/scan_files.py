@@ -61,7 +61,8 @@ def las_corner(paths: Sequence[Path], units_per_metre: float, *, is_all: bool) -
         try:
             with _named(path, "laspy"), _opened_las(path) as file:
                 _check_points(path, file.header.point_count)
-                corners.append(_las_box(file))
+                if file.header.point_count:  # an empty tile's header has zeros
+                    corners.append(_las_box(file))
         except SourceError as error:  # said again where the cloud is read
             fault = error
     if not corners:

@@ -37,13 +37,15 @@ _Parts: TypeAlias = tuple[bytes, bytes, bytes]
 def decoded(contents: bytes, how: int) -> Any:
     """The pixels of an image, as `cv2.imdecode` gives them for this flag; None where it cannot be decoded.
 
+    They lie as they are stored, as the camera's intrinsics count them, whatever orientation the EXIF block names.
     The file must be complete, as `headers.is_complete` says. Memory holds no more than its header announces.
     """
     parts = _inflated(contents)
     found = None if parts is None else _unfiltered(*parts, how)
     if found is not None:
         return found
-    return cv2.imdecode(np.frombuffer(contents if parts is None else _with_stored(*parts), np.uint8), how)
+    coded = np.frombuffer(contents if parts is None else _with_stored(*parts), np.uint8)
+    return cv2.imdecode(coded, how | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
 def _inflated(contents: bytes) -> _Parts | None:

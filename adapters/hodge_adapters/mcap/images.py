@@ -195,7 +195,7 @@ def _decoded(payload: Payload, layout: ImageLayout) -> Pixels:
             return decode_rvl(contents, layout.width * layout.height).reshape(layout.height, layout.width)
         except Malformed as error:
             raise payload.error(str(error)) from error
-    flags = cv2.IMREAD_UNCHANGED if layout.is_depth else cv2.IMREAD_COLOR
+    flags = cv2.IMREAD_UNCHANGED if layout.is_depth else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     stored = cv2.imdecode(np.frombuffer(_coded_bytes(payload, layout), np.uint8), flags)
     if stored is None or stored.shape[:2] != (layout.height, layout.width):
         raise payload.error("the image cannot be decoded")

@@ -79,10 +79,10 @@ class LogFile(MessageFile):
         damage = record.start - RECORD_HEAD_BYTES
         if not self._has_footer:
             until = f"whole records up to byte {damage} of {size} were read, with what is left of the next"
-            self.complaints.loses(f"{self.path.name}: cut off: {until}: {self.read_so_far()}")
+            self.complaints.loses(self.path, f"{self.path.name}: cut off: {until}: {self.read_so_far()}")
             return None
         following = next((offset for offset in self._chunk_offsets if offset >= record.start), size)
-        self.complaints.loses(f"{self.path.name}: damaged at byte {damage}: went on at byte {following}")
+        self.complaints.loses(self.path, f"{self.path.name}: damaged at byte {damage}: went on at byte {following}")
         return following
 
     def _record(self, read: ReadAt, record: Record) -> Iterator[Logged]:
@@ -91,6 +91,7 @@ class LogFile(MessageFile):
                 chunk = parse_chunk(read, record)
                 yield from self._chunk(read, chunk, record.complete)
             except Malformed as error:
+                self.complaints.damaged.add(self.path)
                 self.complaints.count(self.path.name, str(error))
         elif record.opcode == Opcode.MESSAGE:
             yield from self._message(read, record, None)

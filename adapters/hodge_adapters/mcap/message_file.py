@@ -41,12 +41,12 @@ class Complaints:
         self._counts: Counter[tuple[str, str]] = Counter()
         self._lines: list[str] = []
         self._others = 0
-        self.incomplete = 0
-        """How many files are cut off or damaged, so that messages are lost."""
+        self.damaged: set[Path] = set()
+        """The files that are cut off or damaged, so that messages are lost."""
 
-    def loses(self, line: str) -> None:
+    def loses(self, path: Path, line: str) -> None:
         """Report that a file lost messages."""
-        self.incomplete += 1
+        self.damaged.add(path)
         self.say(line)
 
     def count(self, where: str, what: str) -> None:

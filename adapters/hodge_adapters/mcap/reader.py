@@ -106,7 +106,7 @@ class McapReader:
             notes.append(f"{recording.transforms.other_parents} transforms of frames with two parents left out")
         if recording.transforms.replaced:
             notes.append(f"{counted(recording.transforms.replaced, 'static transform')} replaced by a later, other one")
-        doubts = [Note("recording incomplete", recording.complaints.incomplete)] * bool(recording.complaints.incomplete)
+        doubts = [Note("recording incomplete", len(damaged))] if (damaged := recording.complaints.damaged) else []
         frames, camera_frame = self._frames(path, recording, notes, doubts)
         frames = frames[:: self.every]
         stamps_s = np.array([frame.stamp_s for frame in frames], float)

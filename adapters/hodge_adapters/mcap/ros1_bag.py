@@ -55,9 +55,12 @@ class BagFile(MessageFile):
                     raise BreaksOff
                 at = start + length
             except BreaksOff:
-                self.complaints.loses(f"{self.path.name}: cut off at byte {at} of {end}: {self.read_so_far()}")
+                self.complaints.loses(
+                    self.path, f"{self.path.name}: cut off at byte {at} of {end}: {self.read_so_far()}"
+                )
                 return
             except Malformed as error:
+                self.complaints.damaged.add(self.path)
                 self.complaints.count(self.path.name, str(error))
                 at = start + length
 

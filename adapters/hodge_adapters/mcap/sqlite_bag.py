@@ -36,7 +36,7 @@ class SqliteBag(MessageFile):
         except DAMAGED as error:
             if not self.tallies:
                 raise SourceError(f"{self.path}: not a whole SQLite bag ({error}): record or copy it again") from error
-            self.complaints.loses(f"{self.path.name}: damaged ({error}): {self.read_so_far()}")
+            self.complaints.loses(self.path, f"{self.path.name}: damaged ({error}): {self.read_so_far()}")
 
     def _rows(self, database: sqlite3.Connection) -> Iterator[Logged]:
         channels = self._channels(database)

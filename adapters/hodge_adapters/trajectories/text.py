@@ -235,4 +235,6 @@ def _read_times(path: Path, count: int) -> Floats:
 def _unreadable(path: Path, bad: Sequence[Row], expected: str) -> SourceError:
     if not bad:
         return SourceError(f"{path}: no pose in it: expected lines of {expected}")
-    return SourceError(f"{path}:{bad[0].line}: `{' '.join(bad[0].fields)[:80]}` is no pose: expected {expected}")
+    fields = bad[0].fields
+    shown = f"`{' '.join(fields)[:80]}` of {counted(len(fields), 'column')}"
+    return SourceError(f"{path}:{bad[0].line}: {shown} is no pose: expected {expected}")

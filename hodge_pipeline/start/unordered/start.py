@@ -127,6 +127,8 @@ def _none_joined(scene: Frames, hypotheses: Edges, piece: Ints) -> tuple[Note, .
         return ()
     if all(frame.world_from_cam is not None for frame in scene.frames):
         return (Note("none joined", detail="--set start=given begins from the poses that they bring"),)
+    if not len(hypotheses):
+        return (Note("none joined", detail="no pair was tried"),)
     count, why = max(((count, why) for why, count in hypotheses.rejected_counts.items()), default=(0, "none was tried"))
     return (Note("none joined", detail=f"{count} of {len(hypotheses)} pairs: {why}; take more between them"),)
 
