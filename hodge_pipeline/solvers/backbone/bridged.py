@@ -78,13 +78,17 @@ def infer_bridged(
     told = without_bias(parted, first.scales)
     if told is None:
         return found
+
+    def is_told_by(used: Bools) -> bool:  # not by loops that are refused with it
+        rows = np.flatnonzero(used)
+        return without_bias(parted.with_loops(rows, parted.ends[rows]), first.scales) is not None
+
     unbiased = joined(told)
     second = by.infer(unbiased)
-    if second is None:
+    if second is None or second.confirmed and not is_told_by(second.used):
         return found
     (apart, other), (chain, before) = judged(unbiased, second), found
-    rows = np.flatnonzero(other.used)
-    if without_bias(parted.with_loops(rows, parted.ends[rows]), first.scales) is None:  # told by loops that are refused
+    if not is_told_by(other.used):
         return found
     likelier = other.of_places > before.of_places + BY_CHANCE * len(unbiased.bias)
     if apart.broken.sum() > chain.broken.sum():  # breaks may only mend what the wrong bias did
