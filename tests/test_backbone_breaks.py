@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from backbone_graphs import WORLDS, broken, drive, spanned
-from benchmarks.spoilt_graphs import simulated_cases
 from hodge_pipeline.diagnosis.diagnosis import diagnose
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.solvers.backbone.trust import find_backbone
@@ -99,13 +98,6 @@ def test_where_odometry_notices_its_breaks_loops_call_no_step_wrong() -> None:
     graph = broken(drive(loops=200), 90)
     assert np.flatnonzero(diagnose(graph).verdict[:399] == "wrong").tolist() == [90]
     assert diagnose(graph, DiagnosisOptions(trust="sequential", most_breaks=0)).kept[:399].all()
-
-
-def test_a_break_over_which_the_loops_then_are_of_one_corridor_is_none() -> None:
-    """Of 40 groups of wrong loops one says much with a bridge as far as it asks: without the count 18.7 m, not .12."""
-    name = "corridor, 5 right, 200 wrong by 5, information stated"
-    backbone = find_backbone(next(case.graph for case in simulated_cases(1) if case.name == name))
-    assert backbone is not None and backbone.found.confirmed and not backbone.chain.broken.any()
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.5, 0.9, 1.0])

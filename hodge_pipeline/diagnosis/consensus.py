@@ -39,16 +39,6 @@ def find_consensus(evidence: Evidence) -> Solved:
     return _mended(evidence, grown)
 
 
-def sought_from(evidence: Evidence, best: Solved, start: Floats) -> Solved:
-    """The solution from poses `start (V, 4, 4)`, if it uses more edges than the best so far, else the best.
-
-    χ² does not decide: that of a graph torn by groups of wrong loops may be smaller.
-    """
-    begun = Alignment(np.zeros(len(start), np.int64), start)
-    other = fit(evidence, fit(evidence, begun, ANNEALED), (GATE,))
-    return max(best, other, key=lambda found: int(found.used.sum()))
-
-
 def agreeing(evidence: Evidence, found: Solved) -> Floats:
     """The probability (E,) that each edge is right, given the solution."""
     clipped = np.clip(np.sqrt(np.maximum(0.0, 1 - found.chi2 / GATE)), EXTREME, 1 - EXTREME)

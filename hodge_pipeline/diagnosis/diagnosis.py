@@ -13,7 +13,7 @@ from hodge_pipeline.complex.chi2 import has_unit_information, in_vertex_order
 from hodge_pipeline.complex.closing import cycle_errors
 from hodge_pipeline.complex.free_directions import free_direction_notes
 from hodge_pipeline.complex.short_cycles import with_cycles_of
-from hodge_pipeline.diagnosis.consensus import agreeing, find_consensus, sought_from
+from hodge_pipeline.diagnosis.consensus import agreeing, find_consensus
 from hodge_pipeline.diagnosis.cycles import Cycles, close_by_chance, is_folded, judge_cycles, witnesses
 from hodge_pipeline.diagnosis.evidence import Evidence, every_pair_tried, gather
 from hodge_pipeline.diagnosis.noise import Noise
@@ -114,11 +114,7 @@ def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbo
         return judged.found
     if judged.explains_nothing:
         return backbone or find_backbone(graph, in_lattice=True) or judged.found
-    backbone, explains_more = lattice_backbone(graph, judged.found.kept, backbone)
-    if backbone is None or explains_more:
-        return backbone or judged.found
-    # groups of wrong loops may have torn the solution apart, which the poses of the backbone hold together
-    return judged.sought_from(backbone.world_from_cam) if backbone.found.confirmed else judged.found
+    return lattice_backbone(graph, judged.found.kept, backbone) or judged.found
 
 
 def _is_room(graph: ViewGraph) -> bool:
@@ -176,15 +172,7 @@ class _ByCycles:
     @cached_property
     def found(self) -> Diagnosis:
         """The diagnosis of that solution."""
-        return self._diagnosis(self.fit)
-
-    def sought_from(self, world_from_cam: Floats) -> Diagnosis:
-        """The diagnosis of the solution sought from poses (V, 4, 4) too."""
-        in_order = world_from_cam[np.argsort(self.rank)] @ self.there
-        return self._diagnosis(sought_from(self.evidence, self.fit, in_order))
-
-    def _diagnosis(self, fit: Solved) -> Diagnosis:
-        stated, evidence, there = self.stated, self.evidence, self.there
+        stated, evidence, there, fit = self.stated, self.evidence, self.there, self.fit
         agrees = agreeing(evidence, fit)
         cycles = _with_witnesses(self.cycles, fit.used, evidence)
         blame = share_blame(cycles, fit, evidence)

@@ -172,7 +172,7 @@ class Chain:
 
     def between(self, a: Floats, b: Floats) -> Floats:
         """Motions `a⁻¹ b` (..., 4, 4)."""
-        return np.asarray(se3.inverse(a) @ b) if self.is_spatial else plane.between(a, b)
+        return np.asarray(se3.inverse(a) @ b)
 
     def log(self, motions: Floats) -> Floats:
         """Twists (..., p) of the free axes."""

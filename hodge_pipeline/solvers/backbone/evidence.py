@@ -9,16 +9,13 @@ from scipy.special import gammaln
 
 from hodge_pipeline.complex.chi2 import FREEDOM
 from hodge_pipeline.solvers.backbone.chain import Chain
-from hodge_pipeline.solvers.backbone.levels import RANDOM
+from hodge_pipeline.solvers.backbone.levels import FEWEST, RANDOM
 from hodge_pipeline.solvers.backbone.linear import cholesky, motion_residuals
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.types import Bools, Floats, Ints
 
 BY_CHANCE = float(np.log(100.0))
 """Log-evidence, in nats, that chance reaches in one graph of a hundred."""
-FEWEST_PAIRS = 200
-"""Fewest random pairs of positions that an outlier shape is estimated from; an octave with fewer gets that of any two.
-"""
 
 
 @dataclass(frozen=True)
@@ -35,14 +32,16 @@ class OutlierModel:
 
     @classmethod
     def of(cls, chain: Chain) -> OutlierModel:
-        """Estimated from the loops' motions put between random positions of one path."""
+        """Estimated from the loops' motions put between random positions of one path; an octave that hardly any path is
+        as long as gets the shape of any two.
+        """
         rng = np.random.default_rng(0)
         pairs = rng.integers(0, chain.size, (RANDOM, 2))
         shapes = [_shape(chain, pairs[_on_one_path(chain, pairs)], rng)]
         for octave in reversed(range(int(np.log2(max(chain.size, 2))))):
             pairs[:, 1] = pairs[:, 0] + rng.integers(2**octave, 2 ** (octave + 1), RANDOM)
             near = pairs[_on_one_path(chain, pairs)]
-            shapes.append(_shape(chain, near, rng) if len(near) >= FEWEST_PAIRS else shapes[0])
+            shapes.append(_shape(chain, near, rng) if len(near) >= FEWEST else shapes[0])
         across, along = _never_contradicted(chain, shapes[0])
         return cls(*np.linalg.eigh(across @ np.stack(shapes[::-1]) @ across + along))
 

@@ -50,20 +50,21 @@ def judge(linear: Linear, fit: Fit | None, shares: Floats, outliers: OutlierMode
 
 def uncertainty(linear: Linear, fit: Fit | None) -> Floats:
     """The covariance (M, p, p) of each loop's residual at the poses of a fit, ∞ where its ends are not connected."""
-    own = linear.loops[1]
-    out = _along_path(linear, np.arange(len(own)), np.inf)
+    along = by_path(linear, np.arange(len(linear.loops[1])), np.inf)
     if fit is None or not len(fit.reduced.active):
-        return out + own
-    through = _through_ends(fit)
-    is_nearer = np.einsum("mii->m", through) < np.einsum("mii->m", out)
-    return np.asarray(np.where(is_nearer[:, None, None], through, out) + own)
+        return along
+    through = _through_ends(fit) + linear.loops[1]
+    is_nearer = np.einsum("mii->m", through) < np.einsum("mii->m", along)
+    return np.where(is_nearer[:, None, None], through, along)
 
 
-def by_path(linear: Linear, rows: Ints) -> Floats:
-    """The covariance (K, p, p) of the residuals of loops (rows) along the bare chain; that of the loop alone where its
-    ends lie on two paths.
+def by_path(linear: Linear, rows: Ints, apart: float = 0.0) -> Floats:
+    """The covariance (K, p, p) of the residuals of loops (rows) along the bare chain; where their ends lie on two
+    paths, `apart` more than that of the loop alone.
     """
-    return linear.loops[1][rows] + _along_path(linear, rows, 0.0)
+    chain = linear.chain
+    between = np.where(chain.apart[rows, None, None], apart, linear.path(*chain.ends[rows].T))
+    return np.asarray(linear.loops[1][rows] + between)
 
 
 def densities(linear: Linear, rows: Ints, outliers: OutlierModel) -> tuple[Floats, Floats]:
@@ -71,12 +72,6 @@ def densities(linear: Linear, rows: Ints, outliers: OutlierModel) -> tuple[Float
     covariance, residual = by_path(linear, rows), linear.loops[0][rows]
     log_wrong = outliers.at(linear.chain, rows, residual).log_density(covariance)
     return student_log_density(residual, covariance)[0], log_wrong
-
-
-def _along_path(linear: Linear, rows: Ints, otherwise: float) -> Floats:
-    """The covariance (K, p, p) of the path between the ends of loops (rows), `otherwise` between two paths."""
-    apart = linear.chain.apart[rows, None, None]
-    return np.where(apart, otherwise, linear.path(*linear.chain.ends[rows].T))
 
 
 def _through_ends(fit: Fit) -> Floats:
@@ -101,7 +96,7 @@ def _through_ends(fit: Fit) -> Floats:
     for rows in np.split(np.arange(len(first)), np.arange(BATCH, len(first), BATCH)):
         moved = linear.carry(first[rows], second[rows]) @ samples[pairs[0, rows]]
         difference = samples[pairs[1, rows]] - moved
-        spread[rows] = difference @ np.swapaxes(difference, 1, 2) / max(SAMPLES - gap.shape[1] - 1, 1)
+        spread[rows] = difference @ np.swapaxes(difference, 1, 2) / (SAMPLES - gap.shape[1] - 1)
     into = linear.carry(second[of_loop], chain.ends[:, 1])
     gap += into @ spread[of_loop] @ np.swapaxes(into, 1, 2)
     gap[np.not_equal(*reduced.network.component[np.stack(near)])] = np.inf

@@ -54,25 +54,24 @@ def _is_rival(left_out: int, uncontradicted: int) -> bool:
     return uncontradicted >= max(UNCONTRADICTED * left_out, 1)
 
 
-def lattice_backbone(graph: ViewGraph, kept: Bools, doubted: Backbone | None = None) -> tuple[Backbone | None, bool]:
-    """The backbone of a lattice or a room if it rivals the edges `kept (E,)` without one, else None; and whether it
-    explains more than these: it confirms loops of more places, or few places speak against it.
+def lattice_backbone(graph: ViewGraph, kept: Bools, doubted: Backbone | None = None) -> Backbone | None:
+    """The backbone of a lattice or a room if it explains more than the edges `kept (E,)` without one, else None: it
+    confirms loops of more places, or few places speak against it.
 
     It is a rival where the kept edges leave out steps that no near loop contradicts. A backbone that is `doubted` by
     its own loops is also one where it explains enough.
     """
     if doubted is not None and _explains_enough(doubted, kept):
-        return doubted, True
+        return doubted
     left_out, uncontradicted = left_out_steps(graph, kept)
     backbone = (doubted or find_backbone(graph, in_lattice=True)) if _is_rival(left_out, uncontradicted) else None
     if backbone is None:
-        return None, False
+        return None
     for_it, against = backbone.places(backbone.used & ~kept), backbone.places_against(kept)
     unlikely = left_out if doubted or not backbone.found.confirmed else uncontradicted
-    if against < PLACES_PER_WRONG_STEP * unlikely:
-        return backbone, True
     weight = PLACES_PER_WRONG_STEP if is_tested(backbone.chain) else 1.0
-    return backbone, backbone.found.confirmed and weight * for_it > against
+    confirmed = backbone.found.confirmed and weight * for_it > against
+    return backbone if confirmed or against < PLACES_PER_WRONG_STEP * unlikely else None
 
 
 def _explains_enough(backbone: Backbone, kept: Bools) -> bool:

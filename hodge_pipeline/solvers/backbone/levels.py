@@ -14,5 +14,7 @@ RANDOM = 4000
 """Random pairs of places, from which distributions by chance are known to a few hundredths."""
 SIGMAS = 3.0
 """Standard deviations, or usual errors, beyond which an error is no chance: a normal one in 400."""
+SINGULAR = 1e-6
+"""Share of a variance below which it is none: rounding, or an axis along which nothing moves."""
 TOLERANCE = 1e-4
 """Relative tolerance of χ² of solves that only judge edges."""

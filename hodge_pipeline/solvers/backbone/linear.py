@@ -13,7 +13,7 @@ import numpy as np
 
 from hodge_pipeline import se3
 from hodge_pipeline.solvers.backbone.chain import Chain
-from hodge_pipeline.types import Floats, Ints
+from hodge_pipeline.types import Floats, Ints, ViewGraph
 
 
 @dataclass(frozen=True)
@@ -95,6 +95,14 @@ def motion_residuals(chain: Chain, motion: Floats, from_a: Floats, from_b: Float
     """Residuals (K, p) of motions between poses a and b (K, 4, 4), about b in world axes."""
     twist = chain.log(chain.between(motion, chain.between(from_a, from_b)))
     return np.asarray(np.einsum("nij,nj->ni", chain.adjoint(turned(from_b)), twist))
+
+
+def graph_of(chain: Chain, count: int, edges: Ints, motion: Floats, covariance: Floats) -> ViewGraph:
+    """A graph of `count` vertices by edges (E, 2) with covariances (E, p, p) in the chain's axes, to be solved."""
+    information = np.zeros((len(edges), 6, 6))
+    information[:, chain.axes[:, None], chain.axes] = inverse(covariance)
+    dimension = 3 if chain.is_spatial else 2
+    return ViewGraph.from_edges(np.arange(count), edges, motion, information, dimension=dimension)
 
 
 def turned(poses: Floats) -> Floats:

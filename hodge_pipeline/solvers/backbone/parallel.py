@@ -40,12 +40,11 @@ def fused(graph: ViewGraph, repeats: Bools) -> Fused:
     first, second = _repeated(graph, np.flatnonzero(repeats))
     if len(second) < FEWEST:
         return Fused(graph, whole, whole[:0], whole[:0])
-    unknown, graph = has_unit_information(graph), in_vertex_order(graph)[0]
+    graph = in_vertex_order(graph)[0]
     apart, chi2 = _apart(graph, first, second)
     agree = chi2 <= _usual(graph, chi2) * tail_gate(len(free_axes(graph)), 1 / len(chi2))
     motions, total = _mean(graph, first[agree], second[agree], apart[agree])
     left = np.setdiff1d(whole, second[agree])
-    total = graph.information if unknown else total
     return Fused(replace(graph, i_from_j=motions, information=total).select(left), left, second[agree], whole[:0])
 
 
@@ -53,25 +52,22 @@ def loops_once(given: Fused, loops: Bools) -> Fused:
     """The graph in which copies among the `loops (E,)` of the graph that was given count once: their mean, with the
     information of one, since all register the same two views.
 
-    Copies differ by no more than usual and close as short cycles do. The scale of errors is else that of the copies.
+    Copies differ from the first by no more than usual and close as short cycles do. The scale of errors is else that of
+    the copies.
     """
     graph = in_vertex_order(given.graph)[0]
-    axes, unknown, limits = free_axes(graph), has_unit_information(graph), gate_of(graph.i_from_j[~loops[given.rows]])
-    rows, usual, found = np.flatnonzero(loops[given.rows]), None, []
-    while len((pair := _repeated(graph, rows))[1]):
-        first, second = pair
-        apart, chi2 = _apart(graph, first, second)
-        near = closes(graph.i_from_j[first], graph.i_from_j[second], limits)
-        usual = usual or _usual(graph, chi2[near])
-        agree = near & (chi2 <= usual * tail_gate(len(axes), 1 / len(chi2)))
-        found.append((first[agree], second[agree], apart[agree]))
-        rows = np.setdiff1d(rows, np.concatenate([first, second[agree]]))
-    if not any(len(first) for first, _, _ in found):
+    limits = gate_of(graph.i_from_j[~loops[given.rows]])
+    first, second = _repeated(graph, np.flatnonzero(loops[given.rows]))
+    if not len(second):
         return given
-    first, second, apart = (np.concatenate(each) for each in zip(*found, strict=True))
-    motions, total = _mean(graph, first, second, apart)
-    times = 1 + np.bincount(first, minlength=graph.edge_count)[:, None, None]
-    graph = replace(graph, i_from_j=motions, information=graph.information if unknown else total / times)
+    apart, chi2 = _apart(graph, first, second)
+    near = closes(graph.i_from_j[first], graph.i_from_j[second], limits)
+    agree = near & (chi2 <= _usual(graph, chi2[near]) * tail_gate(len(free_axes(graph)), 1 / len(chi2)))
+    first, second = first[agree], second[agree]
+    motions, total = _mean(graph, first, second, apart[agree])
+    if not has_unit_information(graph):
+        total /= 1 + np.bincount(first, minlength=graph.edge_count)[:, None, None]
+    graph = replace(graph, i_from_j=motions, information=total)
     left = np.setdiff1d(np.arange(graph.edge_count), second)
     copies, copied = given.rows[second], given.rows[first]
     return replace(given, graph=graph.select(left), rows=given.rows[left], copies=copies, copied=copied)
@@ -101,7 +97,9 @@ def _usual(graph: ViewGraph, chi2: Floats) -> float:
 
 
 def _mean(graph: ViewGraph, first: Ints, second: Ints, apart: Floats) -> tuple[Floats, Floats]:
-    """The motions (E, 4, 4) and information (E, 6, 6) where the second edges are fused into the first ones."""
+    """The motions (E, 4, 4) and information (E, 6, 6) where the second edges are fused into the first ones; the
+    identity, for unknown information, stays.
+    """
     axes, information, total = free_axes(graph), graph.information[second], graph.information.copy()
     pull = np.zeros((graph.edge_count, 6))
     np.add.at(total, first, information)
@@ -111,4 +109,4 @@ def _mean(graph: ViewGraph, first: Ints, second: Ints, apart: Floats) -> tuple[F
     spread = se3.covariances(total[changed[:, None, None], axes[:, None], axes])
     mean[:, axes] = np.einsum("nij,nj->ni", spread, pull[changed[:, None], axes])
     motions[changed] = motions[changed] @ se3.exp(mean)
-    return motions, total
+    return motions, graph.information if has_unit_information(graph) else total

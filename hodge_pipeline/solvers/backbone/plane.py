@@ -14,22 +14,11 @@ def exp(xi: Floats) -> Floats:
     sine, cosine = np.sin(half), np.cos(half)
     share = np.divide(sine, half, out=np.ones_like(half), where=half != 0)
     across, along = sine * share, cosine * share  # (1 − cos φ) / φ, sin φ / φ
-    x, y = along * xi[..., 1] - across * xi[..., 2], across * xi[..., 1] + along * xi[..., 2]
-    return _motions(cosine**2 - sine**2, 2 * sine * cosine, x, y)
-
-
-def between(a: Floats, b: Floats) -> Floats:
-    """Motions `a⁻¹ b` (..., 4, 4)."""
-    c, s = a[..., 0, 0], a[..., 1, 0]
-    x, y = b[..., 0, 3] - a[..., 0, 3], b[..., 1, 3] - a[..., 1, 3]
-    cosine, sine = b[..., 0, 0], b[..., 1, 0]
-    return _motions(c * cosine + s * sine, c * sine - s * cosine, c * x + s * y, c * y - s * x)
-
-
-def _motions(cosine: Floats, sine: Floats, x: Floats, y: Floats) -> Floats:
-    out = np.zeros((*x.shape, 4, 4))
-    out[..., 0, 0] = out[..., 1, 1] = cosine
-    out[..., 1, 0], out[..., 0, 1], out[..., 0, 3], out[..., 1, 3] = sine, -sine, x, y
+    out = np.zeros((*half.shape, 4, 4))
+    out[..., 0, 0] = out[..., 1, 1] = cosine**2 - sine**2
+    out[..., 1, 0], out[..., 0, 1] = 2 * sine * cosine, -2 * sine * cosine
+    out[..., 0, 3] = along * xi[..., 1] - across * xi[..., 2]
+    out[..., 1, 3] = across * xi[..., 1] + along * xi[..., 2]
     out[..., 2, 2] = out[..., 3, 3] = 1.0
     return out
 

@@ -15,6 +15,7 @@ from hodge_pipeline.solvers.backbone.fit import Fit, optimised, thinned
 from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS, SIGMAS
 from hodge_pipeline.solvers.backbone.linear import linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
+from hodge_pipeline.solvers.reweighted import SETTLED
 from hodge_pipeline.types import Bools, Floats, Ints
 
 LEAST_NAMED = float(np.log(1.07))
@@ -26,8 +27,6 @@ the literature to .004 to .1, of 100 simulated ones to .09 but for a few.
 """
 SPREAD = 0.5
 """Prior standard deviation of a factor, for one that loops do not tell."""
-SETTLED = 1e-3
-"""Change of the logarithm of a factor that ends its refits."""
 
 
 @dataclass(frozen=True)

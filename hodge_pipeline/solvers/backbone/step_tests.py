@@ -26,7 +26,7 @@ def is_tested(chain: Chain) -> bool:
     """Whether short cycles of one loop that close pass over more than `TESTED` of the steps."""
     (low, high), poses = chain.ends.T, chain.poses
     short = np.flatnonzero(~chain.apart & (high - low <= LONGEST_CYCLE))
-    closing = short[closes(chain.motion[short], _between(poses, low[short], high[short]), gate(chain))]
+    closing = short[closes(chain.motion[short], chain.between(poses[low[short]], poses[high[short]]), gate(chain))]
     return bool((chain.over(chain.ends[closing]) > 0).sum() > TESTED * (chain.step_edge >= 0).sum())
 
 
@@ -55,12 +55,13 @@ def agreeing_loops(chain: Chain, among: Bools) -> int:
         fits = (low[other] == moved[0]) & (high[other] == moved[1])
         first = np.flatnonzero(fits & (path[low] == path[low[other]]) & (path[high] == path[high[other]]))
         second = other[first]
-        before, after = _between(poses, low[first], low[second]), _between(poses, high[second], high[first])
+        before = chain.between(poses[low[first]], poses[low[second]])
+        after = chain.between(poses[high[second]], poses[high[first]])
         ahead, motion = before @ chain.motion[rows[second]] @ after, chain.motion[rows[first]]
         spread = chain.covariance[rows[first]] + chain.covariance[rows[second]]
         spread = spread + (chain.step_covariance[low[second]] if down else 0.0)
         spread = spread + (chain.step_covariance[high[first] + max(up, 0)] if up else 0.0)
-        chi2 = mahalanobis(chain.log(se3.inverse(motion) @ ahead), spread)[0]
+        chi2 = mahalanobis(chain.log(chain.between(motion, ahead)), spread)[0]
         closing = closes(motion, ahead, limits) | chain.stated & (chi2 < AS_STATED * len(chain.axes))
         out[first[closing]] = out[second[closing]] = True
     return int(out.sum())
@@ -83,10 +84,6 @@ def gate_of(steps: Floats) -> tuple[float, float]:
 
 TURN_RAD = 0.1
 """Least angle of a step that counts as usual, for backbones that go straight on."""
-
-
-def _between(poses: Floats, a: Ints, b: Ints) -> Floats:
-    return np.asarray(se3.inverse(poses[a]) @ poses[b])
 
 
 def closes(motion: Floats, other: Floats, limits: tuple[float, float], widened: Floats | float = 1.0) -> Bools:

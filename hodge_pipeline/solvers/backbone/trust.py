@@ -24,7 +24,7 @@ from hodge_pipeline.solvers.backbone.linear import Linear, inverse
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.mistakes import shared_shift
 from hodge_pipeline.solvers.backbone.parallel import Fused, fused, loops_once
-from hodge_pipeline.solvers.backbone.polish import LOCAL
+from hodge_pipeline.solvers.backbone.polish import LOCAL, ROUNDS
 from hodge_pipeline.solvers.backbone.sequence import (
     consecutive_edges,
     linear_forest,
@@ -219,19 +219,23 @@ def find_backbone(
     if trust == NONE or not graph.edge_count:
         return None
     ids, graph = graph.vertex_ids, replace(graph, dimension=2 if moves_in_plane(graph) else 3)
-    graph = numbered_along_path(graph) if trust in (AUTO, SEQUENTIAL) else graph
-    chosen = consecutive_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
+    by_order = trust in (AUTO, SEQUENTIAL)
+    graph = numbered_along_path(graph) if by_order else graph
+    if trust == AUTO and sequential_edges(graph).sum() < max(FEWEST, NEARLY_ALL * graph.vertex_count):
+        return None
+    chosen = consecutive_edges(graph) if by_order else _of_source(graph, trust)
+    if not chosen.any():
+        raise GraphError("no edge joins consecutive vertices, so that there is no sequence to trust: use --trust none")
     repeats = chosen.copy()
-    if trust not in (AUTO, SEQUENTIAL):  # repeats of edges outside its paths are loops, as these edges are
+    if not by_order:  # repeats of edges outside its paths are loops, as these edges are
         pair = np.sort(graph.edges, axis=1) @ [graph.vertex_count, 1]
         repeats &= np.isin(pair, pair[_in_order(graph, repeats)])
-    single = loops_once(fused(graph, repeats), ~chosen) if chosen.any() else fused(graph, repeats)
-    single = windowed(single) if trust in (AUTO, SEQUENTIAL) else single
+    single = loops_once(fused(graph, repeats), ~chosen)
+    single = windowed(single) if by_order else single
     backbone = _of_single_steps(graph, single, trust, in_lattice, most_breaks, is_lattice)
     if backbone is None:
         return None
-    named = backbone.named if trust in (AUTO, SEQUENTIAL) else f"edges of {trust}"
-    return replace(backbone, named=named, vertex_ids=ids)
+    return replace(backbone, named=backbone.named if by_order else f"edges of {trust}", vertex_ids=ids)
 
 
 def _of_single_steps(
@@ -239,12 +243,9 @@ def _of_single_steps(
 ) -> Backbone | None:
     """The backbone of a graph, judged on its fused graph with one edge for each step: see `find_backbone`."""
     graph = single.graph
-    chosen = sequential_edges(graph) if trust in (AUTO, SEQUENTIAL) else _of_source(graph, trust)
-    if trust == AUTO and chosen.sum() < max(FEWEST, NEARLY_ALL * graph.vertex_count):
-        return None
-    if not chosen.any():
-        raise GraphError("no edge joins consecutive vertices, so that there is no sequence to trust: use --trust none")
-    steps = chosen if trust in (AUTO, SEQUENTIAL) else _in_order(graph, chosen)
+    by_order = trust in (AUTO, SEQUENTIAL)
+    chosen = sequential_edges(graph) if by_order else _of_source(graph, trust)
+    steps = chosen if by_order else _in_order(graph, chosen)
     chain = make_chain(graph, steps)
     if not len(chain.loop_edge):
         return None
@@ -354,7 +355,7 @@ def of_every_loop(graph: ViewGraph, backbone: Backbone, trusted: Bools) -> Backb
     rare = 1 / backbone.loops_used.sum()
     gate = tail_gate(size, rare)
     poses, weight, off = backbone.world_from_cam, np.ones(len(rows)), np.zeros(len(rows), bool)
-    for _ in range(MOST_SOLVED):
+    for _ in range(ROUNDS):
         heavy_tailed = replace(weighted, information=weighted.information * weight[:, None, None])
         poses = solve(heavy_tailed, start=poses, initial="given", relative_tolerance=TOLERANCE).world_from_cam
         chi2 = np.where(trusted[rows], 0.0, chi2_by_information(weighted, poses))
@@ -367,7 +368,5 @@ def of_every_loop(graph: ViewGraph, backbone: Backbone, trusted: Bools) -> Backb
     return replace(backbone, used=used, right=right, world_from_cam=poses)
 
 
-MOST_SOLVED = 5
-"""Reweighted solves, each in seconds for 100,000 edges."""
 UNUSED = 0.49
 """Largest probability that is reported of an unused loop."""

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import (
     EXACT,
     MEDIAN_CHI2,
@@ -19,7 +18,7 @@ from hodge_pipeline.solvers.backbone.chain import STEPS_OF_PLACE, Chain, make_ch
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis
 from hodge_pipeline.solvers.backbone.judge import by_path
 from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS, NEARLY_ALL, TOLERANCE
-from hodge_pipeline.solvers.backbone.linear import inverse, linearise
+from hodge_pipeline.solvers.backbone.linear import graph_of, inverse, linearise
 from hodge_pipeline.solvers.backbone.parallel import Fused
 from hodge_pipeline.solvers.backbone.sequence import sequential_edges, steps_apart
 from hodge_pipeline.solvers.backbone.step_tests import (
@@ -34,7 +33,7 @@ from hodge_pipeline.solvers.backbone.step_tests import (
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.reweighted import SETTLED
 from hodge_pipeline.solvers.weights import FLOOR
-from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
+from hodge_pipeline.types import Bools, Floats, Ints
 
 WRITTEN, TURNED_RAD = 5e-6, 10.0
 """Largest rounding error, as a share of the number, where six digits are written, as streams of C++ do; and an angle
@@ -56,7 +55,7 @@ def windowed(given: Fused) -> Fused:
     if not _many(chain, near):
         return given
     low, high = chain.ends[near].T
-    along = se3.inverse(chain.poses[low]) @ chain.poses[high]
+    along = chain.between(chain.poses[low], chain.poses[high])
     closing, unknown = closes(chain.motion[near], along, gate(chain), np.sqrt(high - low)), has_unit_information(graph)
     if unknown and 2 * closing.sum() < len(near):  # errors that are learned from wrong edges would explain all
         return given
@@ -75,7 +74,7 @@ def windowed(given: Fused) -> Fused:
     to = at[fused_steps]
     step = chain.step_edge[to]
     edges[step] = np.stack([chain.order[to - 1], chain.order[to]], axis=1)
-    motions[step] = se3.inverse(poses[to - 1]) @ poses[to]
+    motions[step] = chain.between(poses[to - 1], poses[to])
     if not unknown:
         own = np.zeros(chain.size)
         own[at] = of_step
@@ -154,7 +153,7 @@ def _doubted(chain: Chain, near: Ints, fits: Bools, closing: Bools) -> Bools:
     pairs, spans = pairs_across(ends[others], far_off | ~chain.inner)
     one, other = others[pairs].T
     (low, high), (low_other, high_other) = ends[one].T, ends[other].T
-    before, after = se3.inverse(poses[low]) @ poses[low_other], se3.inverse(poses[high_other]) @ poses[high]
+    before, after = chain.between(poses[low], poses[low_other]), chain.between(poses[high_other], poses[high])
     passed = np.abs(ends[one] - ends[other]).sum(axis=1)
     confirms = closes(chain.motion[one], before @ chain.motion[other] @ after, gate(chain), np.sqrt(passed))
     return np.asarray(doubted & (chain.over(spans[confirms]) == 0))
@@ -179,20 +178,15 @@ def _agreeing(chain: Chain, near: Ints, fits: Bools, scale: float, doubted: Bool
     at = np.flatnonzero(chain.step_edge >= 0)
     step = np.where(doubted & (chain.over(ends) > 1), 0.0, 1.0)[at]
     weights = np.concatenate([step, fits.astype(float)])
-    information = np.zeros((len(weights), 6, 6))
-    information[:, chain.axes[:, None], chain.axes] = inverse(
-        np.concatenate([chain.step_covariance[at], chain.covariance[near]])
+    edges = np.concatenate([np.stack([at - 1, at], axis=1), ends])
+    motion, covariance = (
+        np.concatenate(each)
+        for each in ((chain.step[at], chain.motion[near]), (chain.step_covariance[at], chain.covariance[near]))
     )
-    graph = ViewGraph.from_edges(
-        np.arange(chain.size),
-        np.concatenate([np.stack([at - 1, at], axis=1), ends]),
-        np.concatenate([chain.step[at], chain.motion[near]]),
-        information,
-        dimension=3 if chain.is_spatial else 2,
-    )
+    graph = graph_of(chain, chain.size, edges, motion, covariance)
 
     def solved(weights: Floats, start: Floats) -> Floats:
-        weighted = replace(graph, information=information * np.maximum(weights, FLOOR)[:, None, None])
+        weighted = replace(graph, information=graph.information * np.maximum(weights, FLOOR)[:, None, None])
         return solve(weighted, start=start, initial="given", relative_tolerance=TOLERANCE).world_from_cam
 
     poses = solved(weights, chain.poses)
@@ -202,8 +196,8 @@ def _agreeing(chain: Chain, near: Ints, fits: Bools, scale: float, doubted: Bool
         if np.abs(weights - before).max() < SETTLED:
             break
         poses = solved(weights, poses)
-    i, j = graph.edges.T
-    near_enough = closes(graph.i_from_j, se3.inverse(poses[i]) @ poses[j], gate(chain), np.sqrt(np.abs(j - i)))
+    i, j = edges.T
+    near_enough = closes(motion, chain.between(poses[i], poses[j]), gate(chain), np.sqrt(j - i))
     agree = (chi2 <= STUDENT_99[size]) | chain.stated & near_enough & (chi2 * scale < AS_STATED * size)
     return np.where(agree, weights, 0.0), poses
 
@@ -229,6 +223,6 @@ def _information(chain: Chain, poses: Floats, own: Floats, near: Ints, weights: 
     for back in range(int((high - low).max())):
         rows = np.flatnonzero(high - low > back)
         at = high[rows] - back
-        carry = chain.adjoint(se3.inverse(poses[high[rows]]) @ poses[at])
+        carry = chain.adjoint(chain.between(poses[high[rows]], poses[at]))
         np.add.at(total, at, np.swapaxes(carry, 1, 2) @ each[rows] @ carry)
     return total
