@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -95,13 +96,27 @@ def test_a_run_that_stopped_half_way_can_only_be_looked_at(tiny_sequence: Path, 
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
-def test_a_review_that_is_asked_to_end_leaves_no_socket_behind(graph_file: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_a_review_that_is_asked_to_end_leaves_no_socket_behind(graph_file: Path) -> None:  # noqa: F811
     pytest.importorskip("viser", reason="viser is not installed: pip install 'hodge-pipeline[review]'")
-    (temporary := tmp_path / "temporary").mkdir()
     serve = [sys.executable, "-m", "hodge_pipeline.cli.main", "review", str(graph_file), "--no-browser"]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": str(temporary)}
-    with subprocess.Popen(serve, stdout=subprocess.PIPE, text=True, env=environment) as process:
-        assert process.stdout is not None and process.stdout.readline().startswith("http://")
-        assert list(temporary.glob("hodge-review-*"))
-        process.terminate()
-    assert not list(temporary.glob("hodge-review-*"))
+    with tempfile.TemporaryDirectory() as temporary:
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": temporary}
+        with subprocess.Popen(serve, stdout=subprocess.PIPE, text=True, env=environment) as process:
+            assert process.stdout is not None and process.stdout.readline().startswith("http://")
+            assert list(Path(temporary).glob("hodge-review-*"))
+            process.terminate()
+        assert not list(Path(temporary).glob("hodge-review-*"))
+
+
+def test_a_folder_of_temporary_files_too_long_for_a_socket_is_refused(
+    graph_file: Path,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Viser waited without end for a server that never started."""
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'hodge-pipeline[review]'")
+    (long := tmp_path / ("long" * 25)).mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(long))
+    with pytest.raises(WorkspaceError, match="TMPDIR"):
+        Review(graph_file)
+    assert not list(long.iterdir())

@@ -35,6 +35,8 @@ def test_ctrl_c_during_the_import_of_open3d_waits_for_its_end(tmp_path: Path) ->
     """Stopped while it starts, open3d ended the command with code 1 and pages of memory statistics."""
     (tmp_path / "open3d.py").write_text("import signal\nsignal.raise_signal(signal.SIGINT)\nprint('whole')\n")
     script = textwrap.dedent("""
+        import signal
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell lets its background jobs ignore it
         try:
             from hodge_pipeline import lean_open3d
         except KeyboardInterrupt:

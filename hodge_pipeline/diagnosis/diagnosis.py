@@ -30,7 +30,7 @@ from hodge_pipeline.solvers.backbone.lattice import lattice_backbone, steps_are_
 from hodge_pipeline.solvers.backbone.sequence import sequential_edges, vertex_ranks
 from hodge_pipeline.solvers.backbone.step_tests import is_tested
 from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
-from hodge_pipeline.solvers.explained import is_explained
+from hodge_pipeline.solvers.explained import is_each_explained, is_explained
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.weights import OUT_OF_PLANE, dimension_of
 from hodge_pipeline.types import Bools, Floats, Ints, Solution, ViewGraph
@@ -83,16 +83,16 @@ def _poses(graph: ViewGraph, found: Backbone | Diagnosis, judged: Diagnosis) -> 
 
 
 def errs_as_stated(graph: ViewGraph, found: Backbone | Diagnosis, kept: ViewGraph, solution: Solution) -> bool:
-    """Whether the information of the kept edges explains what their maximum-likelihood solution leaves over, and so do
-    the errors that were learned: among stated ones far too large wrong edges are not seen, which then bend the poses.
+    """Whether the information of the kept edges explains what their maximum-likelihood solution leaves over, of all
+    together and of each, and the errors that were learned explain each: among stated ones far too large wrong edges are
+    not seen, which then bend the poses.
     """
-    if not is_explained(kept, solution):
-        return False
     if isinstance(found, Backbone):
         learned = found.weighted(graph, correlated=False)
     else:
         learned = replace(graph, information=found.information).select(found.kept)
-    return is_explained(replace(learned, priors=kept.priors, fixed=kept.fixed), solution)
+    each = (is_each_explained(edges, solution.world_from_cam) for edges in (kept, learned))
+    return is_explained(kept, solution) and all(each)
 
 
 def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbone | Diagnosis:

@@ -6,7 +6,7 @@ import io
 import os
 import socket
 import tempfile
-import threading
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
 from pathlib import Path
@@ -52,7 +52,8 @@ class Review:
     def wait(self) -> None:
         """Return when the review is interrupted (Ctrl-C)."""
         with suppress(KeyboardInterrupt):
-            threading.Event().wait()
+            while True:  # a signal just before an endless wait would not end it
+                time.sleep(1.0)
 
     def close(self) -> None:
         """Stop serving; every decision is on disk already."""
@@ -115,6 +116,9 @@ class Viewer:
 
         self._folder = tempfile.TemporaryDirectory(prefix="hodge-review-")
         self.path = Path(self._folder.name) / "viser"
+        if len(os.fsencode(self.path)) > LONGEST_SOCKET:  # viser would wait for a server that never starts
+            self._folder.cleanup()
+            raise WorkspaceError(f"{self.path}: too long a name for a Unix socket: set TMPDIR to a shorter folder")
         with _silent(), _listening_on(self.path):
             self.server: Any = Private(host="127.0.0.1", port=0, verbose=False)
         if not self.path.is_socket():
@@ -128,6 +132,10 @@ class Viewer:
         with _silent():
             self.server.stop()
         self._folder.cleanup()
+
+
+LONGEST_SOCKET = 103
+"""Bytes of the name of a Unix socket that every system takes."""
 
 
 @contextmanager

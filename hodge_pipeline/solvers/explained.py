@@ -10,23 +10,24 @@ from scipy.special import chdtri
 from hodge_pipeline.complex.chi2 import chi2_by_information, has_unit_information
 from hodge_pipeline.solvers.backbone.levels import SIGMAS
 from hodge_pipeline.solvers.weights import PLANAR_AXES, dimension_of, measured_axes
-from hodge_pipeline.types import Solution, ViewGraph
+from hodge_pipeline.types import Floats, Solution, ViewGraph
 
 
 def is_explained(graph: ViewGraph, solution: Solution) -> bool:
-    """Whether the χ² of the maximum-likelihood solution of all edges agrees with its degrees of freedom, from which it
-    differs by √(2 degrees of freedom), and the largest χ² of an edge is one that chance reaches among as many; False
-    where the information is the identity that stands for unknown.
+    """Whether the χ² of the maximum-likelihood solution of all edges agrees with its degrees of freedom; False where
+    the information is the identity that stands for unknown. Its standard deviation is √(2 degrees of freedom).
     """
     if has_unit_information(graph):
         return False
     freedom = degrees_of_freedom(graph, solution)
-    if freedom <= 0:
-        return True
+    return freedom <= 0 or solution.metrics["objective"] <= freedom + SIGMAS * math.sqrt(2 * freedom)
+
+
+def is_each_explained(graph: ViewGraph, world_from_cam: Floats) -> bool:
+    """Whether the largest χ² of an edge at poses (V, 4, 4) is one that chance reaches among as many edges."""
+    chi2 = chi2_by_information(graph, world_from_cam)
     size = len(PLANAR_AXES) if dimension_of(graph) == 2 else 6
-    largest = chi2_by_information(graph, solution.world_from_cam).max(initial=0.0)
-    by_chance = chdtri(size, LEAST_SHARE / max(graph.edge_count, 1))
-    return bool(largest <= by_chance and solution.metrics["objective"] <= freedom + SIGMAS * math.sqrt(2 * freedom))
+    return bool(chi2.max(initial=0.0) <= chdtri(size, LEAST_SHARE / max(len(chi2), 1)))
 
 
 LEAST_SHARE = 0.01
