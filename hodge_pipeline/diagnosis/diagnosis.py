@@ -72,7 +72,7 @@ def kept_graph(graph: ViewGraph, found: Backbone | Diagnosis) -> ViewGraph:
 
 def _poses(graph: ViewGraph, found: Backbone | Diagnosis, judged: Diagnosis) -> Floats:
     """The maximum-likelihood poses (V, 4, 4) of the kept edges where these err as they state (`errs_as_stated`), else
-    those of the judgement, by learned errors. The former are 6 % nearer the truth on 64 simulated walks.
+    those of the judgement, by learned errors. Of 432 simulated walks positions are 7 % nearer the truth so.
     """
     is_stated = found.chain.stated if isinstance(found, Backbone) else not has_unit_information(graph)
     if not (is_stated and judged.kept.any()):
@@ -87,12 +87,12 @@ def errs_as_stated(graph: ViewGraph, found: Backbone | Diagnosis, kept: ViewGrap
     together and of each, and the errors that were learned explain each: among stated ones far too large wrong edges are
     not seen, which then bend the poses.
     """
+    poses = solution.world_from_cam
+    if not (is_explained(kept, solution) and is_each_explained(kept, poses)):
+        return False
     if isinstance(found, Backbone):
-        learned = found.weighted(graph, correlated=False)
-    else:
-        learned = replace(graph, information=found.information).select(found.kept)
-    each = (is_each_explained(edges, solution.world_from_cam) for edges in (kept, learned))
-    return is_explained(kept, solution) and all(each)
+        return is_each_explained(found.weighted(graph, correlated=False), poses)
+    return is_each_explained(replace(graph, information=found.information).select(found.kept), poses)
 
 
 def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbone | Diagnosis:

@@ -31,8 +31,8 @@ def is_each_explained(graph: ViewGraph, world_from_cam: Floats) -> bool:
 
 
 LEAST_SHARE = 0.01
-"""Share of graphs whose largest χ² may be larger by chance. Without this an edge that nothing tests, wrong by 1 m, bent
-5600 right ones of a street: 6.1 m for 0.95.
+"""Share of graphs whose largest χ² may be larger by chance. Without this one wrong edge that nothing tests bent the
+other 5600 of a city's streets: 6.1 m for 0.95.
 """
 
 
