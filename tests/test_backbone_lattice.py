@@ -51,3 +51,13 @@ def test_steps_left_out_that_nothing_near_contradicts_speak_for_a_confirmed_back
     assert left_out_steps(graph, kept) == (free + contradicted, free)
     assert 4 < backbone.places(kept & ~backbone.used) < 8
     assert (lattice_backbone(graph, kept) is not None) == stands
+
+
+def test_only_loops_over_steps_that_are_left_out_speak_against_the_backbone(
+    graph: ViewGraph, backbone: Backbone
+) -> None:
+    wrong, steps = np.flatnonzero(~backbone.used), np.arange(1, STEPS)
+    low, high = np.sort(graph.edges[wrong], axis=1).T
+    against = np.array([backbone.places_against(without(graph, step)) for step in steps])
+    over = ((low <= steps[:, None]) & (steps[:, None] < high)).sum(axis=1)
+    assert (against <= over).all() and against.max() > 2 and against.min() == 0

@@ -114,6 +114,18 @@ def test_a_wrong_step_under_two_good_loops_leaves_both_loops_alone() -> None:
     assert set(np.flatnonzero(found.verdict != CONSISTENT).tolist()) == {2, 3, 4, 5, 6}, "2 - 3 - … - 7 are in series"
 
 
+def test_one_far_likelier_wrong_than_the_others_of_its_only_loop_is_no_tie() -> None:
+    """Edges over one step and over five are right, and those over two wrong, one of them in a triangle at the end."""
+    count, two = 40, [*((k, k + 2) for k in range(0, 34, 2)), (37, 39)]
+    edges = np.array([*((k, k + 1) for k in range(count - 1)), *((k, k + 5) for k in range(33)), *two])
+    wrong = np.arange(len(edges) - len(two), len(edges))
+    graph = spoiled(measured(poses_on_a_ring(count), edges), wrong)[0]
+    found = diagnose(graph, DiagnosisOptions(trust=NONE))
+    assert (found.verdict[wrong] == WRONG).all() and not found.kept[wrong].any() and found.kept.sum() == 72
+    assert found.verdict[37:39].tolist() == [UNTESTABLE, UNTESTABLE]
+    assert "one of its 3 edges is wrong, and edges as far apart as this one often are" in found.reason[-1]
+
+
 def test_edges_in_series_are_those_of_the_same_cycles() -> None:
     edges = np.array([*SQUARES, (5, 6), (6, 6), (0, 1)])
     classes = series_classes(edges, 7)

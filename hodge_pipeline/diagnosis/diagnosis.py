@@ -30,7 +30,7 @@ from hodge_pipeline.solvers.backbone.lattice import lattice_backbone, steps_are_
 from hodge_pipeline.solvers.backbone.sequence import sequential_edges, vertex_ranks
 from hodge_pipeline.solvers.backbone.step_tests import is_tested
 from hodge_pipeline.solvers.backbone.trust import AUTO, Backbone, find_backbone
-from hodge_pipeline.solvers.explained import is_each_explained, is_explained
+from hodge_pipeline.solvers.explained import is_each_explained, is_each_usual, is_explained
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.weights import OUT_OF_PLANE, dimension_of
 from hodge_pipeline.types import Bools, Floats, Ints, Solution, ViewGraph
@@ -91,8 +91,13 @@ def errs_as_stated(graph: ViewGraph, found: Backbone | Diagnosis, kept: ViewGrap
     if not (is_explained(kept, solution) and is_each_explained(kept, poses)):
         return False
     if isinstance(found, Backbone):
-        return is_each_explained(found.weighted(graph, correlated=False), poses)
-    return is_each_explained(replace(graph, information=found.information).select(found.kept), poses)
+        learned, steps = found.weighted(graph, correlated=False), found.steps[found.used]
+    else:
+        learned, steps = (
+            replace(graph, information=found.information).select(found.kept),
+            np.zeros(kept.edge_count, bool),
+        )
+    return is_each_explained(learned, poses) or is_each_usual(kept, poses, steps)
 
 
 def backbone_or_diagnosis(graph: ViewGraph, options: DiagnosisOptions) -> Backbone | Diagnosis:

@@ -18,7 +18,8 @@ class SharedBlame:
     """Where an alignment had to leave out one of several edges that no cycle distinguishes.
 
     - `untestable (E,)`: used edges that may be wrong in place of one left out, which are those in series with it and
-      bridges over which no cycle closes; and edges whose only test is one failing cycle.
+      bridges over which no cycle closes; and edges whose only test is one failing cycle, but for one left out that is
+      likelier wrong than all the others together.
     - `cycle (E,)`: the shortest failing cycle of each untestable edge, and of each edge left out in place of one; −1
       elsewhere.
     - `probability (E,)`: that an edge left out in place of another is right, by the prior odds of the edges of its
@@ -53,6 +54,7 @@ def share_blame(cycles: Cycles, fit: Solved, evidence: Evidence) -> SharedBlame:
     probability = np.zeros(count)
     named = left_out & (cycle >= 0)  # of a large graph the longest cycles are not listed
     probability[named] = 1 - odds[named] / among[cycle[named]]
+    undecided &= ~named | (probability >= 0.5)  # what is likelier wrong than all the others is no tie
     return SharedBlame(unconfirmed | undecided, cycle, probability)
 
 

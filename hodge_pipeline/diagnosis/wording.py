@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from hodge_pipeline.complex.series import series_classes
 from hodge_pipeline.diagnosis.cycles import Cycles
-from hodge_pipeline.diagnosis.result import CONSISTENT, UNTESTABLE
+from hodge_pipeline.diagnosis.result import CONSISTENT, UNTESTABLE, WRONG
 from hodge_pipeline.types import Bools, Floats, Ints, ViewGraph
 
 LONGEST_NAMED = 12
@@ -49,7 +49,8 @@ def reasons(
     lines = []
     for edge in range(count):
         if undecided[edge] >= 0:
-            lines.append(_undecided(graph, cycles, int(undecided[edge]), undecided >= 0))
+            why = "edges as far apart as this one often are" if verdict[edge] == WRONG else "no other cycle says which"
+            lines.append(f"{_undecided(graph, cycles, int(undecided[edge]), undecided >= 0)}, and {why}")
         elif verdict[edge] == UNTESTABLE:
             lines.append(TOO_LONG if in_loop[edge] else "no cycle passes it: nothing in the graph can test it")
         else:
@@ -105,7 +106,7 @@ def _undecided(graph: ViewGraph, cycles: Cycles, row: int, doubted: Bools) -> st
     else:
         which = "one of " + ", ".join(f"{i}-{j}" for i, j in graph.vertex_ids[graph.edges[mates]].tolist())
     loop = f"the loop {name_cycle(graph, cycles, row)} {cycle_error(cycles, row)}"
-    return f"{loop}: {which} is wrong, and no other cycle says which"
+    return f"{loop}: {which} is wrong"
 
 
 def cycle_error(cycles: Cycles, row: int) -> str:

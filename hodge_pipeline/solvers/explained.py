@@ -7,10 +7,10 @@ import math
 import numpy as np
 from scipy.special import chdtri
 
-from hodge_pipeline.complex.chi2 import chi2_by_information, has_unit_information
+from hodge_pipeline.complex.chi2 import EXACT, MEDIAN_CHI2, chi2_by_information, has_unit_information
 from hodge_pipeline.solvers.backbone.levels import SIGMAS
 from hodge_pipeline.solvers.weights import PLANAR_AXES, dimension_of, measured_axes
-from hodge_pipeline.types import Floats, Solution, ViewGraph
+from hodge_pipeline.types import Bools, Floats, Solution, ViewGraph
 
 
 def is_explained(graph: ViewGraph, solution: Solution) -> bool:
@@ -28,6 +28,19 @@ def is_each_explained(graph: ViewGraph, world_from_cam: Floats) -> bool:
     chi2 = chi2_by_information(graph, world_from_cam)
     size = len(PLANAR_AXES) if dimension_of(graph) == 2 else 6
     return bool(chi2.max(initial=0.0) <= chdtri(size, LEAST_SHARE / max(len(chi2), 1)))
+
+
+def is_each_usual(graph: ViewGraph, world_from_cam: Floats, steps: Bools) -> bool:
+    """Whether the largest χ² of the `steps (E,)` at poses (V, 4, 4), and of the other edges, is one that chance reaches
+    by errors of which the median of each is the usual one.
+    """
+    chi2 = chi2_by_information(graph, world_from_cam)
+    size = len(PLANAR_AXES) if dimension_of(graph) == 2 else 6
+    for each in (chi2[steps], chi2[~steps]):
+        each = each[each > EXACT * each.max(initial=0.0)]
+        if len(each) and each.max() > np.median(each) / MEDIAN_CHI2[size] * chdtri(size, LEAST_SHARE / len(chi2)):
+            return False
+    return True
 
 
 LEAST_SHARE = 0.01
