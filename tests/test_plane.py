@@ -28,5 +28,12 @@ def test_carried_covariances_are_those_of_space(shape: tuple[int, ...]) -> None:
     factor = rng.normal(size=(*shape, 3, 3))
     covariance = factor @ np.swapaxes(factor, -1, -2)
     adjoint = se3.adjoint(a)[..., PLANAR_AXES[:, None], PLANAR_AXES]
+    np.testing.assert_array_equal(plane.adjoint(a), adjoint)
     expected = adjoint @ covariance @ np.swapaxes(adjoint, -1, -2)
     np.testing.assert_allclose(plane.carried(a, covariance), expected, atol=1e-10)
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (3,), (2, 3)])
+def test_motions_between_poses_are_those_of_space(shape: tuple[int, ...]) -> None:
+    a, b = plane.exp(np.random.default_rng(2).normal(0, 3, (2, *shape, 3)))
+    np.testing.assert_allclose(plane.between(a, b), se3.inverse(a) @ b, atol=1e-12)

@@ -152,7 +152,7 @@ class Chain:
 
     def adjoint(self, poses: Floats) -> Floats:
         """Adjoint matrices (..., p, p) of poses, in the free axes."""
-        return np.asarray(se3.adjoint(poses)[..., self.axes[:, None], self.axes])
+        return se3.adjoint(poses) if self.is_spatial else plane.adjoint(poses)
 
     def lever(self, origin: Floats) -> Floats:
         """Lever arms (K, 3, 3), (K, 2, 1) in the plane: the lower left block of the adjoint of a shift by −origin."""
@@ -172,7 +172,7 @@ class Chain:
 
     def between(self, a: Floats, b: Floats) -> Floats:
         """Motions `a⁻¹ b` (..., 4, 4)."""
-        return np.asarray(se3.inverse(a) @ b)
+        return np.asarray(se3.inverse(a) @ b) if self.is_spatial else plane.between(a, b)
 
     def log(self, motions: Floats) -> Floats:
         """Twists (..., p) of the free axes."""

@@ -33,6 +33,27 @@ def log(motions: Floats) -> Floats:
     return np.stack([2 * half, along * x + half * y, along * y - half * x], axis=-1)
 
 
+def between(a: Floats, b: Floats) -> Floats:
+    """Motions `a⁻¹ b` (..., 4, 4)."""
+    cosine, sine, ahead, aside = a[..., 0, 0], a[..., 1, 0], b[..., 0, 0], b[..., 1, 0]
+    x, y = b[..., 0, 3] - a[..., 0, 3], b[..., 1, 3] - a[..., 1, 3]
+    out = np.zeros(np.broadcast_shapes(a.shape, b.shape))
+    out[..., 0, 0] = out[..., 1, 1] = cosine * ahead + sine * aside
+    out[..., 1, 0] = cosine * aside - sine * ahead
+    out[..., 0, 1] = -out[..., 1, 0]
+    out[..., 0, 3], out[..., 1, 3] = cosine * x + sine * y, cosine * y - sine * x
+    out[..., 2, 2] = out[..., 3, 3] = 1.0
+    return out
+
+
+def adjoint(motions: Floats) -> Floats:
+    """Adjoint matrices (..., 3, 3)."""
+    out = np.zeros((*motions.shape[:-2], 3, 3))
+    out[..., 0, 0], out[..., 1, 0], out[..., 2, 0] = 1.0, motions[..., 1, 3], -motions[..., 0, 3]
+    out[..., 1:, 1:] = motions[..., :2, :2]
+    return out
+
+
 def carried(motions: Floats, covariance: Floats) -> Floats:
     """Covariances `Ad Σ Adᵀ` (..., 3, 3)."""
     c, s, x, y = motions[..., 0, 0], motions[..., 1, 0], motions[..., 1, 3], -motions[..., 0, 3]

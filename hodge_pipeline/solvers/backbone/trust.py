@@ -124,12 +124,13 @@ class Backbone:
         return len(one_of_each_place(replace(chain, ends=ends).places[chosen]))
 
     def places_against(self, edges: Bools) -> int:
-        """How many pairs of places those of the edges (E,) join that it leaves out and that pass over a step which the
-        edges lack, a shared shift counting as one.
+        """How many pairs of places those of the edges (E,) join that it leaves out, a shared shift counting as one; if it
+        confirms others, of those alone that pass over a step which the edges lack.
         """
         against, shifts, chain = edges & ~self.used, 0, self.chain
-        torn = np.cumsum(~np.append(edges, True)[chain.step_edge])
-        against[chain.loop_edge] &= np.not_equal(*torn[chain.ends].T) | chain.apart
+        if self.found.confirmed:
+            torn = np.cumsum(~np.append(edges, True)[chain.step_edge])
+            against[chain.loop_edge] &= np.not_equal(*torn[chain.ends].T) | chain.apart
         for each in self.found.mistakes():
             rows = chain.loop_edge[each.rows]
             if each.nats > BY_CHANCE and each.is_shift and against[rows].any():
