@@ -124,8 +124,8 @@ class Backbone:
         return len(one_of_each_place(replace(chain, ends=ends).places[chosen]))
 
     def places_against(self, edges: Bools) -> int:
-        """How many pairs of places those of the edges (E,) join that it leaves out, a shared shift counting as one; if it
-        confirms others, of those alone that pass over a step which the edges lack.
+        """How many pairs of places those of the edges (E,) join that it leaves out, a shared shift counting as one; of
+        those alone that pass over a step which the edges lack, if it confirms others.
         """
         against, shifts, chain = edges & ~self.used, 0, self.chain
         if self.found.confirmed:
