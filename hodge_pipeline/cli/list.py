@@ -38,13 +38,14 @@ def next_command(path: Path, facts: dict[str, Any], reader: str | None, settings
         return command("hodge", "refine", "trajectory", path, "--frames", "DIR", "--out", f"runs/{path.stem}")
     from hodge_pipeline.cli.reader_choice import IN_A_RECIPE
     from hodge_pipeline.recipe.recipe_file import recipe_names
+    from hodge_pipeline.sources.opening import RECIPES
 
     given = (*settings, *facts.get("missing", ()))
     options = [word for setting in given for word in ("--set", IN_A_RECIPE + setting.removeprefix(IN_A_RECIPE))]
     name = reader or next((guess["reader"] for guess in facts["formats"]), "")
     if name == "colmap" and not facts["frames with depth"]:  # images alone are nothing to register
         return command("hodge", "refine", "colmap", path, "--out", f"runs/{path.stem}")
-    recipe = "lidar" if facts.get("scanner") and not reader else {"clouds": "scans"}.get(name, name)
+    recipe = "lidar" if facts.get("scanner") and not reader else RECIPES.get(name, name)
     if recipe == "mcap" and facts.get("frames with points") == facts["frames"]:
         recipe = "mcap_clouds"
     brings_poses = path.suffix.lower() == ".e57" or (recipe == "scans" and any(path.glob("*.pose")))
