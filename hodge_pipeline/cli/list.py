@@ -25,13 +25,16 @@ def inspect(path: Path, *, reader: str | None, settings: Sequence[str], as_json:
 
         print_json(facts)
         return
-    for name, value in (*facts.items(), ("next", next_command(path, facts, reader, settings))):
+    following = next_command(path, facts, reader, settings)
+    for name, value in (*facts.items(), *([("next", following)] if following else ())):
         for row, text in enumerate(_rows(value)):
             print(f"{name if row == 0 else '':<33} {text}")
 
 
 def next_command(path: Path, facts: dict[str, Any], reader: str | None, settings: Sequence[str] = ()) -> str:
-    """The command to type next for a path with these `facts`, opened by this reader with these `settings`."""
+    """The command to type next for a path with these `facts`, opened by this reader with these `settings`; "" where no
+    command makes anything of it: images alone, without a pose.
+    """
     if not facts["frames"]:
         if facts.get("graph", {}).get("edges"):
             return command("hodge", "solve", path, "--out", "solved.g2o")
@@ -45,6 +48,8 @@ def next_command(path: Path, facts: dict[str, Any], reader: str | None, settings
     name = reader or next((guess["reader"] for guess in facts["formats"]), "")
     if name == "colmap" and not facts["frames with depth"]:  # images alone are nothing to register
         return command("hodge", "refine", "colmap", path, "--out", f"runs/{path.stem}")
+    if not facts["frames with depth"] and not facts["frames with points"]:
+        return command("hodge", "convert", path, "poses.tum") if facts["frames with a pose"] else ""
     recipe = "lidar" if facts.get("scanner") and not reader else RECIPES.get(name, name)
     if recipe == "mcap" and facts.get("frames with points") == facts["frames"]:
         recipe = "mcap_clouds"
