@@ -13,8 +13,10 @@ SHORT = DemoOptions(frames=8, width=80, height=60, turns=0.03)
 LIGHT = (
     "clouds.voxel_m=0.1", "executor.workers=0", "evaluation.tables=false", "acceptance.min_fitness=0.05",
     "start.min_fitness=0.05", "outer_iterations=1", "edges.max_edges_per_frame=4",
+    "registration=gicp", "start.registration=gicp",
 )  # fmt: skip
-"""What makes a run of the short sequence cheap; its images are too small for a recipe's own options."""
+"""What makes a run of the short sequence cheap; its images are too small for a recipe's own options, and for
+landmarks."""
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from command import hodge
@@ -131,6 +132,20 @@ def test_a_run_prints_a_summary_or_json_or_nothing(short_sequence: Path, tmp_pat
     assert json.loads(hodge(*run, "--json").stdout)["source"]["frames"] == 8
     quiet = hodge(*run, "--quiet")
     assert (quiet.stdout, quiet.stderr) == ("", "")
+
+
+def test_scans_of_which_no_two_are_joined_end_with_3_and_a_single_one_with_0(tmp_path: Path) -> None:
+    (tmp_path / "scans").mkdir()
+    run = ["run", "scans", "--source", tmp_path / "scans", "--out", tmp_path / "run", "--overwrite", "--quiet"]
+    run += [*SETS[:4], "--set", "executor.workers=0"]
+    wall = np.random.default_rng(0).uniform(0, 2, (500, 3)) * [1, 1, 0] + [0, 0, 1]
+    for name, code in (("a", 0), ("b", 3)):
+        np.savetxt(tmp_path / "scans" / f"{name}.xyz", wall)
+        done = hodge(*run)
+        assert done.returncode == code, done.stderr
+    assert "error: no two of 2 scans are joined: " in done.stderr
+    again = hodge("solve", tmp_path / "run", "--quiet")
+    assert again.returncode == 3 and f"are joined: {tmp_path / 'run' / 'report.html'} says why" in again.stderr
 
 
 def test_inspect_says_what_a_folder_is(short_sequence: Path) -> None:  # noqa: F811

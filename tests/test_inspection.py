@@ -57,9 +57,18 @@ def test_a_run_folder_is_no_source(tmp_path: Path) -> None:
         inspect(tmp_path)
 
 
+CLOUDS = {"frames": 3, "frames with depth": 0, "frames with points": 3}
+
+
+def test_images_alone_are_sent_to_no_run_which_would_refuse_them() -> None:
+    images = {**CLOUDS, "frames with points": 0, "formats": [{"reader": "nerfstudio"}]}
+    assert next_command(Path("in"), {**images, "frames with a pose": 3}, None) == "hodge convert in poses.tum"
+    assert next_command(Path("in"), {**images, "frames with a pose": 0}, None) == ""
+
+
 def test_a_reader_without_a_recipe_of_its_name_gets_one_to_type() -> None:
     assert next_command(Path("my data"), {"frames": 0}, None).split(" --")[0] == "hodge refine trajectory 'my data'"
-    command = next_command(Path("in"), {"frames": 3, "frames with depth": 0, "formats": []}, "mine")
+    command = next_command(Path("in"), {**CLOUDS, "formats": []}, "mine")
     assert command == "hodge run clouds --source in --set source.reader=mine --out runs/in"
     facts = {"frames": 3, "frames with depth": 3, "formats": []}
     command = next_command(Path("in"), facts, "tum", ["depth_scale=1000"])
@@ -67,7 +76,7 @@ def test_a_reader_without_a_recipe_of_its_name_gets_one_to_type() -> None:
 
 
 def test_a_recording_of_point_clouds_gets_the_recipe_of_clouds() -> None:
-    facts = {"frames": 3, "frames with depth": 0, "frames with points": 3, "formats": [{"reader": "mcap"}]}
+    facts = {**CLOUDS, "formats": [{"reader": "mcap"}]}
     assert next_command(Path("a.mcap"), facts, None) == "hodge run mcap_clouds --source a.mcap --out runs/a"
     images = {**facts, "frames with depth": 3, "frames with points": 0}
     assert next_command(Path("a.mcap"), images, None) == "hodge run mcap --source a.mcap --out runs/a"
@@ -75,7 +84,7 @@ def test_a_recording_of_point_clouds_gets_the_recipe_of_clouds() -> None:
 
 
 def test_posed_scans_of_an_e57_and_of_3dtk_start_from_their_poses(tmp_path: Path) -> None:
-    facts = {"frames": 3, "frames with depth": 0, "frames with a pose": 3, "formats": [{"reader": "clouds"}]}
+    facts = {**CLOUDS, "frames with a pose": 3, "formats": [{"reader": "clouds"}]}
     model = {"frames": 7, "frames with depth": 0, "formats": [{"reader": "colmap"}]}
     assert next_command(Path("sparse/0"), model, None) == "hodge refine colmap sparse/0 --out runs/0"
     command = next_command(Path("hall.e57"), facts, None)

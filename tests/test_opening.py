@@ -8,9 +8,11 @@ from hodge_adapters.icl_nuim.reader import IclNuimReader
 from hodge_adapters.seven_scenes.reader import SevenScenesReader
 from hodge_adapters.tum.reader import TumReader
 from hodge_pipeline import registry
+from hodge_pipeline.cli.list import next_command
 from hodge_pipeline.demo.sequence import DemoOptions, make_sequence
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.recipe.recipe_file import recipe_names
+from hodge_pipeline.sources.inspect import inspect
 from hodge_pipeline.sources.opening import open_with_reader
 
 
@@ -34,6 +36,13 @@ def numbered(folder: Path, tum_folder: Path) -> Path:
 def test_a_folder_of_another_format_is_refused_with_its_recipe(tum_folder: Path) -> None:
     with pytest.raises(SourceError, match=r"no frame-000000.*looks like tum \(.*\): try the recipe tum"):
         open_with_reader(tum_folder, SevenScenesReader(), recipe_names())
+
+
+def test_scans_are_sent_to_the_recipe_that_inspect_names(tmp_path: Path) -> None:
+    (tmp_path / "a.xyz").write_text("1 2 3\n")
+    with pytest.raises(SourceError, match="looks like clouds .*: try the recipe scans$"):
+        open_with_reader(tmp_path, TumReader(), recipe_names())
+    assert next_command(tmp_path, inspect(tmp_path), None).startswith("hodge run scans ")
 
 
 def test_what_can_be_read_all_the_same_is_noted(tum_folder: Path) -> None:

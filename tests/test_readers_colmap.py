@@ -270,6 +270,27 @@ def test_a_pose_that_is_none_is_refused_by_its_image(tmp_path: Path, x: str) -> 
         ColmapReader().open(tmp_path / "text")
 
 
+@pytest.mark.parametrize(
+    ("name", "column", "remedy"),
+    [
+        ("points3D", 1, "COLMAP writes points that are none, and does not read them: give the model as .bin"),
+        ("cameras", 4, "calibrate the camera again"),
+        ("images", 5, "register the image again"),
+    ],
+)
+def test_no_converter_is_advised_for_numbers_that_are_none(tmp_path: Path, name: str, column: int, remedy: str) -> None:
+    synthetic(tmp_path)
+    path = tmp_path / "text" / f"{name}.txt"
+    lines = path.read_text("utf-8").splitlines()
+    row = next(number for number, line in enumerate(lines) if not line.startswith("#"))
+    words = lines[row].split(" ")
+    words[column] = "nan"
+    path.write_text("\n".join([*lines[:row], " ".join(words), *lines[row + 1 :]]) + "\n", "utf-8")
+    with pytest.raises(SourceError, match=rf"{name}.txt:{row + 1}: `nan`: expected a number: {remedy}") as refused:
+        ColmapReader().open(tmp_path / "text")
+    assert "model_converter" not in str(refused.value)
+
+
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
 def test_text_models_with_a_byte_order_mark_are_refused_by_name(tmp_path: Path, name: str, encoding: str) -> None:

@@ -7,12 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hodge_adapters.trajectories.readers import TumPosesReader
+from hodge_adapters.trajectories.readers import KittiPosesReader, TumPosesReader
 from hodge_adapters.trajectories.rewriting import TumRewriter
 from hodge_adapters.trajectories.text import parse_tum, read_kitti, write_kitti, write_tum
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.sources.inspect import guess_reader
+from hodge_pipeline.stages import FrameReader
 from hodge_pipeline.types import Trajectory
 
 IDENTITY = "0 0 0 0 0 0 1"
@@ -49,6 +50,24 @@ def test_stamps_too_large_for_seconds_are_read_in_their_unit(tmp_path: Path, uni
     moved = Trajectory(read.trajectory.stamps_s, np.tile(se3.exp([0.0, 0, 0, 1, 2, 3]), (2, 1, 1)))
     lines = TumRewriter().rewrite(tmp_path / "out", path, moved).read_text().splitlines()
     assert [line.split()[:2] for line in lines] == [[str(stamp * per_second), "1.0"] for stamp in stamps]
+
+
+@pytest.mark.parametrize(
+    ("reader", "row"),
+    [
+        (TumPosesReader(), "1 0,5 1 1 0 0 0 1"),  # cut at each comma it reads as a pose with a node's number behind
+        (TumPosesReader(), "1,5;0,1;0,2;0,3;0;0;0;1"),
+        (KittiPosesReader(), "1 0 0 0,5 0 1 0 0 0 0 1 2"),
+    ],
+)
+def test_decimal_commas_are_told_with_what_writes_points(tmp_path: Path, reader: FrameReader, row: str) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text(f"# a head, with a comma\n{row}\n")
+    for refused in (reader.open, guess_reader):
+        with pytest.raises(SourceError, match=r"poses.txt: its numbers have decimal commas: write points, by tr ',;' "):
+            refused(path)
+    path.write_text(row.replace(",", ".").replace(";", " "))
+    assert len(guess_reader(path).open(path).trajectory) == 1
 
 
 @pytest.mark.parametrize(

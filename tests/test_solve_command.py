@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 import hodge_pipeline
 from backbone_graphs import drive
+from command import hodge as command
 from command import told
 from hodge_adapters.pose_graphs.g2o import load_g2o, write_g2o
 from hodge_pipeline import se3
@@ -247,7 +248,6 @@ def test_pieces_that_edges_left_out_joined_are_said_first(tmp_path: Path) -> Non
         (range(5), "verdict Solved: chi2"),
         ((0, 1, 4), "verdict In 2 pieces (3, 2 of 6 poses; 1 alone): solved: chi2"),
         ((2,), "verdict 2 of 6 poses joined: solved: chi2"),
-        ((), "verdict Nothing to solve"),
     ],
 )
 def test_pieces_that_no_edge_joins_are_said_first(tmp_path: Path, joined, begins) -> None:
@@ -271,9 +271,21 @@ def test_edges_beside_consecutive_ones_are_counted_in_the_first_line(tmp_path: P
 def test_where_no_edge_says_anything_nothing_is_called_solved(tmp_path, ring, how):
     vertices = "".join(f"VERTEX_SE2 {row} {row} 0 0\n" for row in range(3))
     (tmp_path / "in.g2o").write_text(vertices + ring)
-    text = hodge(tmp_path / "in.g2o", *how, "--out", tmp_path / "out.g2o")
-    assert text.startswith("verdict  Nothing to solve: no edge joins two vertices")
+    done = command("solve", tmp_path / "in.g2o", *how, "--out", tmp_path / "out.g2o")
+    assert done.stdout.startswith("verdict  Nothing to solve: no edge joins two vertices")
+    assert (done.returncode, done.stderr[-91:]) == (
+        3, "error: no edge joins two poses: give a graph with measured edges\n"
+    )  # fmt: skip
     np.testing.assert_array_equal(load_g2o(tmp_path / "out.g2o").trajectory.world_from_cam[:, 0, 3], [0, 1, 2])
+
+
+def test_poses_that_priors_alone_place_are_solved(tmp_path: Path) -> None:
+    information = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
+    lines = [f"VERTEX_SE3:QUAT {k} 0 0 0 0 0 0 1\nEDGE_PRIOR_SE3 {k} {k} 5 0 0 0 0 1 {information}\n" for k in (1, 2)]
+    (tmp_path / "in.g2o").write_text("".join(lines))
+    assert hodge(tmp_path / "in.g2o", "--out", tmp_path / "out.g2o").startswith("verdict  Solved")
+    moved = load_g2o(tmp_path / "out.g2o").trajectory.world_from_cam[:, :3, 3]
+    np.testing.assert_allclose(moved, [[1, 5, 0], [2, 5, 0]], atol=1e-9)
 
 
 def test_what_reader_and_solver_both_note_is_told_once(tmp_path: Path) -> None:

@@ -134,6 +134,18 @@ def test_key_frames_are_registered_and_every_frame_gets_a_pose(run: hodge_pipeli
     assert rows["result"].ate_rmse_m < 0.02
 
 
+@pytest.mark.parametrize("repose", [False, True])
+def test_tracked_steps_stand_in_every_round_where_surfaces_register_pairs(
+    sequence: Path, tmp_path: Path, repose: bool
+) -> None:
+    recipe = small_recipe(sequence, f"start.repose={str(repose).lower()}", "outer_iterations=2")
+    first, *_, last = hodge_pipeline.run(recipe, tmp_path / "run").rounds
+    steps = {tuple(pair): motion for pair, motion in zip(first.edges.pairs.tolist(), first.edges.i_from_j, strict=True)}
+    pairs = [(row, steps[tuple(pair)]) for row, pair in enumerate(last.edges.pairs.tolist()) if tuple(pair) in steps]
+    assert len(pairs) > 2 and len(last.edges.pairs) > len(pairs), "some steps, and some pairs that are none"
+    assert all(np.array_equal(last.edges.i_from_j[row], motion) != repose for row, motion in pairs)
+
+
 def test_every_frame_that_was_found_is_fused(run: hodge_pipeline.Run) -> None:
     found = np.arange(FRAMES) != 5
     keys = replace(run.key_frames, found=found)

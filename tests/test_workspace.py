@@ -51,11 +51,12 @@ def test_the_description_is_the_last_difference_named_and_a_run_that_never_began
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_a_folder_with_other_things_is_never_taken(tmp_path: Path, overwrite: bool) -> None:
-    (tmp_path / "thesis.tex").write_text("years of work")
+@pytest.mark.parametrize("name", ["thesis.tex", "recipe.yaml"])
+def test_a_folder_with_other_things_is_never_taken(tmp_path: Path, name: str, overwrite: bool) -> None:
+    (tmp_path / name).write_text("years of work")
     with pytest.raises(WorkspaceError, match="not empty and not a run folder"):
         Workspace.open(tmp_path, RECIPE, overwrite=overwrite)
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "years of work")]
 
 
 def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:

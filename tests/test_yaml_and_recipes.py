@@ -72,6 +72,7 @@ def test_a_merge_key_is_read_and_cannot_multiply() -> None:
         ("a: &a {<<: *a}", "merged into itself"),
         ("a: 0x" + "f" * 90_000, "a whole number of 360000 bits"),
         ("a: 9223372036854775808", "a whole number of 64 bits"),
+        ("a: -1e308", r"a number past 1e\+100"),
         ("a: " + "9" * 90_000, "digits"),
     ],
 )

@@ -15,6 +15,9 @@ from hodge_pipeline.types.input_files import beginning, read_input_text
 from hodge_pipeline.types.output_files import replacing
 
 _DIGITS = re.compile(r"(\d+)")
+_DECIMAL = r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?"
+DECIMAL_ROW = re.compile(rf"\s*{_DECIMAL}(\s+{_DECIMAL}){{2,}}\s*")
+"""Numbers between blanks that have a comma each at most, such as `1,5 -2,25e-1 3`: as decimal point."""
 SNIFFED_BYTES = 4096
 MAX_NAME_BYTES, MAX_PATH = 255, 2000
 """Bytes of a name in a folder, characters of a path below one: the system refuses longer ones."""

@@ -25,26 +25,32 @@ def inspect(path: Path, *, reader: str | None, settings: Sequence[str], as_json:
 
         print_json(facts)
         return
-    for name, value in (*facts.items(), ("next", next_command(path, facts, reader, settings))):
+    following = next_command(path, facts, reader, settings)
+    for name, value in (*facts.items(), *([("next", following)] if following else ())):
         for row, text in enumerate(_rows(value)):
             print(f"{name if row == 0 else '':<33} {text}")
 
 
 def next_command(path: Path, facts: dict[str, Any], reader: str | None, settings: Sequence[str] = ()) -> str:
-    """The command to type next for a path with these `facts`, opened by this reader with these `settings`."""
+    """The command to type next for a path with these `facts`, opened by this reader with these `settings`; "" where no
+    command makes anything of it: images alone, without a pose.
+    """
     if not facts["frames"]:
         if facts.get("graph", {}).get("edges"):
             return command("hodge", "solve", path, "--out", "solved.g2o")
         return command("hodge", "refine", "trajectory", path, "--frames", "DIR", "--out", f"runs/{path.stem}")
     from hodge_pipeline.cli.reader_choice import IN_A_RECIPE
     from hodge_pipeline.recipe.recipe_file import recipe_names
+    from hodge_pipeline.sources.opening import RECIPES
 
     given = (*settings, *facts.get("missing", ()))
     options = [word for setting in given for word in ("--set", IN_A_RECIPE + setting.removeprefix(IN_A_RECIPE))]
     name = reader or next((guess["reader"] for guess in facts["formats"]), "")
     if name == "colmap" and not facts["frames with depth"]:  # images alone are nothing to register
         return command("hodge", "refine", "colmap", path, "--out", f"runs/{path.stem}")
-    recipe = "lidar" if facts.get("scanner") and not reader else {"clouds": "scans"}.get(name, name)
+    if not facts["frames with depth"] and not facts["frames with points"]:
+        return command("hodge", "convert", path, "poses.tum") if facts["frames with a pose"] else ""
+    recipe = "lidar" if facts.get("scanner") and not reader else RECIPES.get(name, name)
     if recipe == "mcap" and facts.get("frames with points") == facts["frames"]:
         recipe = "mcap_clouds"
     brings_poses = path.suffix.lower() == ".e57" or (recipe == "scans" and any(path.glob("*.pose")))

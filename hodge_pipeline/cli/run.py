@@ -16,7 +16,7 @@ from hodge_pipeline.cli.console import ProgressBars, print_json, print_table
 from hodge_pipeline.cli.options import Shown
 from hodge_pipeline.errors import CheckError, RecipeError, SourceError
 from hodge_pipeline.recipe.schema import load_recipe
-from hodge_pipeline.store.workspace import RECORDING_FILE
+from hodge_pipeline.store.workspace import PAGE_FILE, RECORDING_FILE
 
 if TYPE_CHECKING:
     from hodge_pipeline.run_folder import Run
@@ -48,8 +48,18 @@ def run(
             loaded, out, overwrite=overwrite, watcher=terminal, live=address, dask=dask, strict=strict
         )
     print_result(result, shown)
-    if result.refined is not None and result.refined.decision.exit_code:
-        raise CheckError(result.refined.decision.reason)
+    check_outcome(result)
+
+
+def check_outcome(result: Run) -> None:
+    """Raise `CheckError`, exit code 3, where the guard kept the poses given as better, or no two frames are joined."""
+    report, refined = result.report, result.refined
+    if refined is not None:
+        if refined.decision.exit_code:
+            raise CheckError(refined.decision.reason)
+    elif report.graph is not None and report.graph.vertices > 1 and not report.pieces:
+        of_all = f"of {report.graph.vertices} {report.source.vertex_name}"
+        raise CheckError(f"no two {of_all} are joined: {result.folder / PAGE_FILE} says why")
 
 
 def named_truth(truth: str | None) -> list[str]:

@@ -107,12 +107,13 @@ def solve(
 
 
 def _solve_run(folder: Path, shown: Shown, dask: str | None) -> None:
-    from hodge_pipeline.cli.run import print_result
+    from hodge_pipeline.cli.run import check_outcome, print_result
     from hodge_pipeline.uses.recipe_run import solve_again
 
     with ProgressBars.of(shown) as terminal:
         result = solve_again(folder, watcher=terminal, dask=dask)
     print_result(result, shown)
+    check_outcome(result)
 
 
 def _lines(
@@ -147,6 +148,8 @@ def _headline(solved: SolvedFile) -> str:
 
 
 def _check(summary: dict[str, Any], start: InitialName) -> None:
+    if summary["pieces"] == summary["poses"] > 1:
+        raise CheckError("no edge joins two poses: give a graph with measured edges")
     if summary["certified"] is False:
         raise CheckError("the result is not proven to be the global minimum: see the notes; try --start chordal")
     if summary["confirmed"] is False:

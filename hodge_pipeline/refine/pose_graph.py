@@ -117,7 +117,7 @@ class SolvedFile:
         before, after, name = summary["cost_before"], summary["cost_after"], OBJECTIVES[summary["objective"]]
         after = after if after > ROUNDING * max(before or 0.0, 1.0) else 0.0
         fell = f"{name} {after:.6g}" if before is None else f"{name} {before:.6g} → {after:.6g}"
-        if not self.doubt and summary["edges_ignored"] == summary["edges"]:
+        if not self.doubt and not self._has_priors and summary["edges_ignored"] == summary["edges"]:
             return "Nothing to solve: no edge joins two vertices with information, so every pose is as it was"
         if self.choices.robust and self.solution.confirmed is None and "tested_edges" in self.solution.metrics:
             again = summary["edges"] - summary["edges_ignored"] - summary["poses"] + summary["pieces"]

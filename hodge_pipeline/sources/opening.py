@@ -23,6 +23,9 @@ NAMED = 5
 MARGIN = 0.2
 """By how much its confidence must exceed that of the recipe's reader."""
 
+RECIPES = {"clouds": "scans"}
+"""The recipe to try first for a reader, where it is not the one of its name: nothing tells the order of clouds."""
+
 Fingerprints = dict[Path, tuple[Any, ...]]
 
 
@@ -108,8 +111,8 @@ def _described(guess: Guess) -> str:
 
 def _remedy(reader: str, path: Path, recipes: Collection[str]) -> str:
     """What to try: the recipe named as the reader, else the option that takes it; another command without frames."""
-    if reader in recipes:
-        return f"try the recipe {reader}"
+    if (recipe := RECIPES.get(reader, reader)) in recipes:
+        return f"try the recipe {recipe}"
     try:
         source: Source = registry.load("readers", reader)().open(path)
     except SourceError as error:

@@ -195,11 +195,11 @@ def _check_recipe(folder: Path, recipe: dict[str, Any], overwrite: bool, refusal
     """Write the resolved recipe, or refuse a folder that is not this recipe's."""
     path = folder / RECIPE_FILE
     text = yaml_file.dump(recipe)
-    if path.exists():
-        if _is_text(path, text):
-            return
-        is_begun = (folder / kind).is_dir() and any((folder / kind).iterdir())
-        if not overwrite and is_begun:  # a run that failed before its first stage may be overwritten
+    if path.exists() and _is_text(path, text):
+        return
+    if path.exists() and (folder / kind).is_dir():
+        is_begun = any((folder / kind).iterdir())  # a run that failed before its first stage may be overwritten
+        if not overwrite and is_begun:
             change = _first_change(yaml_file.read(path).data, recipe)
             raise WorkspaceError(f"{folder}: {refusal.replace('{change}', change)}")
     elif any(entry.name != LOCK_FILE for entry in folder.iterdir()):

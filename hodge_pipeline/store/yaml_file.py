@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from ruamel.yaml.composer import MaxDepthExceededError
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
 from hodge_pipeline.errors import RecipeError
+from hodge_pipeline.se3 import MAX_NUMBER
 from hodge_pipeline.types.input_files import read_input_text
 
 MAX_BYTES = 100_000
@@ -144,6 +146,8 @@ def _scalar(node: Any, name: str, line: int) -> Any:
         raise RecipeError(f"{name}:{line}: {node!r} holds a character that no file can have")
     if isinstance(node, int) and not -MAX_INT <= node < MAX_INT:
         raise RecipeError(f"{name}:{line}: a whole number of {node.bit_length()} bits has no use in a recipe")
+    if isinstance(node, float) and MAX_NUMBER <= abs(node) < math.inf:
+        raise RecipeError(f"{name}:{line}: a number past {MAX_NUMBER:g} has no use in a recipe")
     for kind in (bool, int, float, str):
         if isinstance(node, kind):
             return kind(node)

@@ -10,16 +10,13 @@ from pathlib import Path
 
 from hodge_adapters.clouds.columns import NAMES, Columns, is_time, number_rows
 from hodge_adapters.clouds.ply import COLOURS
-from hodge_adapters.text_rows import first_text, reading, to_floats
+from hodge_adapters.text_rows import DECIMAL_ROW, first_text, reading, to_floats
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
 from hodge_pipeline.types.input_files import open_input
 
 SEPARATORS, DECIMAL_COMMAS = bytes.maketrans(b",;", b"  "), bytes.maketrans(b",;", b". ")
 """Between numbers, where a comma is one; where there are semicolons, it is none."""
-_DECIMAL = r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?"
-DECIMAL_ROW = re.compile(rf"\s*{_DECIMAL}(\s+{_DECIMAL}){{2,}}\s*")
-"""Numbers between blanks that have a comma each at most, such as `1,5 -2,25e-1 3`: as decimal point."""
 COMMENTS = (b"#", b"//")
 
 

@@ -21,6 +21,12 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types.input_files import beginning, open_input
 
 REMEDY = "write the model again with `colmap model_converter`"
+AS_BINARY = "COLMAP writes {} that are none, and does not read them: give the model as .bin"
+MEND = {
+    "points3D": AS_BINARY.format("points"), "cameras": "calibrate the camera again",
+    "rigs": "calibrate the rig again", "frames": "register the frame again",
+}  # fmt: skip
+"""What to do with NaN or infinity in a text file, by its stem: a converter does not read them, or writes them again."""
 MAX_NAME_BYTES = 4096
 """The longest path that Linux takes."""
 MARKS = codecs.BOM_UTF8, codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
@@ -48,21 +54,24 @@ def check_words(paths: Sequence[Path]) -> None:
             if path.stem == "cameras" and words[1] not in _camera_models():
                 raise SourceError(f"{path}:{line}: has a camera of the unknown model {words[1][:60]}: {REMEDY}")
             numbers = [word for word in words if word not in _SENSORS and word not in _camera_models()]
-            if numbers and not np.isfinite(to_floats(numbers) or np.nan).all():
+            values = to_floats(numbers)
+            if values is None:
                 raise _fault(path, line, text, "numbers")
+            if not np.isfinite(values).all():
+                raise _none(path, line, numbers, MEND[path.stem])
 
 
 def _check_image_words(path: Path) -> None:
     for line, pose, seen in _image_lines(path):
-        if not np.isfinite(to_floats(pose.split(maxsplit=9)[:9]) or np.nan).all():
+        numbers = pose.split(maxsplit=9)[:9]
+        values = to_floats(numbers)
+        if values is None:
             raise _fault(path, line, pose, "numbers")
+        if not np.isfinite(values).all():
+            raise _none(path, line, numbers, "register the image again")
         words = seen.split()
         if words and not np.isfinite(to_floats(words) or np.nan).all():
-            word = next(word for word in words if not np.isfinite(to_floats([word]) or np.nan).all())
-            raise SourceError(
-                f"{path}:{line + 1}: `{word[:60]}`: expected a number: COLMAP writes features that are none, and does "
-                "not read them: give the model as .bin"
-            )
+            raise _none(path, line + 1, words, AS_BINARY.format("features"))
 
 
 def image_count(path: Path) -> int:
@@ -249,6 +258,11 @@ _LINES: Mapping[str, tuple[Callable[[list[str]], bool], str]] = {
         "FRAME_ID RIG_ID QW QX QY QZ TX TY TZ NUM_DATA_IDS and so many triples of SENSOR_TYPE SENSOR_ID DATA_ID",
     ),
 }
+
+
+def _none(path: Path, line: int, words: Sequence[str], remedy: str) -> SourceError:
+    word = next(word for word in words if not np.isfinite(to_floats([word]) or np.nan).all())
+    return SourceError(f"{path}:{line}: `{word[:60]}`: expected a number: {remedy}")
 
 
 def _fault(path: Path, line: int, text: str, expected: str) -> SourceError:

@@ -8,7 +8,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters.text_rows import first_text, to_floats
-from hodge_adapters.trajectories.text import COLUMNS, parse_tum, read_kitti
+from hodge_adapters.trajectories.text import COLUMNS, decimal_commas, parse_tum, read_kitti
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Source
 
@@ -62,6 +62,8 @@ def first_rows(path: Path) -> list[list[str]]:
 
 
 def _sniff_columns(path: Path, counts: tuple[int, ...], what: str) -> Sniff:
+    if advice := decimal_commas(path):
+        return Sniff(0.0, f"no {what}", advice)
     rows = [to_floats(" ".join(row).replace(",", " ").split()) for row in first_rows(path)]
     rows = rows[1:] if rows and rows[0] is None else rows  # a head without a mark of comment
     good = sum(row is not None and len(row) in counts for row in rows)

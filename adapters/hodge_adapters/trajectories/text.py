@@ -13,7 +13,7 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from hodge_adapters.posed import length_notes, trajectory_of, written
-from hodge_adapters.text_rows import Row, first_text, listed, read_rows, to_floats, write_text_atomically
+from hodge_adapters.text_rows import DECIMAL_ROW, Row, first_text, listed, read_rows, to_floats, write_text_atomically
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Source, Trajectory
@@ -74,7 +74,7 @@ def parse_tum(path: Path) -> ParsedTrajectory:
 
     Lines that are no pose are left out and noted. Raises `SourceError` where no pose is left.
     """
-    table, bad = _tum_table(read_rows(path))
+    table, bad = _tum_table(_rows_with_points(path))
     if not len(table):
         raise _unreadable(path, bad, "stamp tx ty tz qx qy qz qw")
     notes: list[str] = []
@@ -94,6 +94,21 @@ def parse_tum(path: Path) -> ParsedTrajectory:
             f"{listed([r.line for r in bad])}"
         )
     return ParsedTrajectory(parsed.trajectory, tuple(notes))
+
+
+def decimal_commas(path: Path) -> str:
+    """What to do with a file whose first lines have commas for decimal points; "" where they have none."""
+    rows = (line.split("#", 1)[0].replace(";", " ") for line in first_text(path).splitlines())
+    if not any("," in row and DECIMAL_ROW.fullmatch(row) for row in rows):
+        return ""
+    return "its numbers have decimal commas: write points, by tr ',;' '. ' < FILE > NEW, and give the new file"
+
+
+def _rows_with_points(path: Path) -> list[Row]:
+    """The rows of a file. Raises `SourceError` for decimal commas, which `read_rows` would cut numbers at."""
+    if advice := decimal_commas(path):
+        raise SourceError(f"{path}: {advice}")
+    return read_rows(path)
 
 
 def has_w_first(path: Path) -> bool:
@@ -124,7 +139,7 @@ def read_kitti(path: Path, times: Path | None = None) -> Trajectory:
 
     Rotations are projected to SO(3) (the files hold few digits). Raises `SourceError` with `file:line`.
     """
-    rows = read_rows(path)
+    rows = _rows_with_points(path)
     numbers = [to_floats(row.fields) for row in rows]
     bad = [row for row, values in zip(rows, numbers, strict=True) if not values or len(values) != 12]
     if bad or not rows:

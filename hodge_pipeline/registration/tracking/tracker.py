@@ -223,7 +223,7 @@ class _Tracker:
         self._sightings[key.place, view.place] = found
         information = found.information / CORNERS_A_SAMPLE
         motion, count = found.key_from_view, len(found.rows)
-        return Registration(motion, information, found.share, found.rmse_m, count, 1, True, by_landmarks=True)
+        return Registration(motion, information, found.share, found.rmse_m, count, 0, True, by_landmarks=True)
 
     def _of_most_area(
         self, key: TrackedFrame, view: TrackedFrame, found: Followed, guess: Floats
