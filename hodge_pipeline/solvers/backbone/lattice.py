@@ -42,7 +42,7 @@ def left_out_steps(graph: ViewGraph, kept: Bools) -> tuple[int, int]:
     A step that was measured wrong is contradicted by a kept loop over few steps, or by a pair of kept loops across it.
     """
     chain = make_chain(graph, sequential_edges(graph))
-    ends = chain.ends[kept[chain.loop_edge]]
+    ends = np.unique(chain.ends[kept[chain.loop_edge]], axis=0)  # of 20,000 copies of a loop all are pairs
     short = ends[np.diff(ends, axis=1)[:, 0] <= LONGEST_CYCLE]
     left_out = ~np.append(kept, True)[chain.step_edge]
     across = pairs_across(ends, left_out | ~chain.inner)[1]
