@@ -31,13 +31,17 @@ class StepModel:
 
     @classmethod
     def of(cls, chain: Chain) -> StepModel:
-        """Fitted to the steps with Student's t, which single steps hardly change, and to the tail of their χ²."""
+        """Fitted to the steps with Student's t, which single steps hardly change, and to the tail of their χ².
+
+        Each step counts with its mirror image, since turns to the right are as usual as those to the left.
+        """
         rows = np.flatnonzero(chain.measured)
         twist = chain.log(chain.step[rows])
+        twist = np.concatenate([twist, twist @ _mirrored(chain, twist)])
         centre = np.median(twist, axis=0)
         covariance, chi2 = _student_covariance(twist - centre)
         unusual = np.full(chain.size, -np.inf)
-        unusual[rows] = _rarity(chi2) - np.log(len(rows))
+        unusual[rows] = _rarity(chi2[: len(rows)]) - np.log(len(rows))
         return cls(chain.exp(centre), covariance, unusual)
 
     def off(self, pairwise: PairwiseConsistency, loop: Ints, at: Ints) -> tuple[Floats, Floats]:
@@ -68,6 +72,14 @@ def _rarity(chi2: Floats) -> Floats:
     floor = np.quantile(size, NEARLY_ALL)
     mean = float(np.mean(size[size > floor] - floor)) if (size > floor).any() else np.inf
     return np.asarray(np.maximum((size - floor) / mean - np.log(1 - NEARLY_ALL), 0.0))
+
+
+def _mirrored(chain: Chain, twist: Floats) -> Floats:
+    """The rotation (p, p) of twists (M, p) by 180° about their median direction of travel."""
+    ahead = np.zeros(6)
+    ahead[chain.axes] = np.median(twist, axis=0)
+    half = 2 * np.outer(ahead[3:], ahead[3:]) / max(float(ahead[3:] @ ahead[3:]), np.finfo(float).tiny) - np.eye(3)
+    return np.asarray(np.kron(np.eye(2), half)[np.ix_(chain.axes, chain.axes)], float)
 
 
 @dataclass(frozen=True)
