@@ -85,8 +85,8 @@ class PairwiseConsistency:
         return motion, LOOSE**2 * covariance[0]
 
     def seeds(self, among: Ints) -> Iterator[tuple[int, Floats]]:
-        """Unused loops that contradict each other, those first with which most others near them agree, of other places;
-        and the log Bayes factor (K,) of each loop of `among (K,)` given that one.
+        """Unused loops that contradict each other, those first with which most others near them agree, all of one place
+        counting as one; and the log Bayes factor (K,) of each loop of `among (K,)` given that one.
         """
         left = ~self.used[among]
         support = np.full(len(among), -1.0)
@@ -101,16 +101,21 @@ class PairwiseConsistency:
             yield int(among[row]), factor
 
     def _support(self, rows: Ints) -> Floats:
-        """Nats (K,) that the nearest loops of other places gain if each of `rows (K,)` is right."""
+        """Nats (K,) that the nearest loops of each of `rows (K,)` gain if it is right, of its own place as one."""
         if not len(rows):
             return np.zeros(0)
         near = cKDTree(self.chain.places[rows]).query(self.chain.places[rows], k=min(4 * NEIGHBOURS, len(rows)))[1]
         near = near.reshape(len(rows), -1)
         apart = np.abs(self.chain.places[rows[near]] - self.chain.places[rows][:, None]).max(axis=2) >= 1.0
-        first, nth = np.nonzero(apart & (np.cumsum(apart, axis=1) <= NEIGHBOURS))
-        second = rows[near[first, nth]]
-        gain = np.maximum(np.logaddexp(self.factor(rows[first], second), 0.0) - self.by_chain[second], 0.0)
-        return np.asarray(np.bincount(first, gain, minlength=len(rows)), float)
+        same = ~apart & (near != np.arange(len(rows))[:, None])
+        support = np.zeros(len(rows))
+        for kind in (apart, same):
+            first, nth = np.nonzero(kind & (np.cumsum(kind, axis=1) <= NEIGHBOURS))
+            second = rows[near[first, nth]]
+            gain = np.maximum(np.logaddexp(self.factor(rows[first], second), 0.0) - self.by_chain[second], 0.0)
+            share = 1.0 if kind is apart else 1 / np.bincount(first, minlength=len(rows))[first]
+            support += np.bincount(first, share * gain, minlength=len(rows))
+        return support
 
     def gains(self, seed: int, rows: Ints, factor: Floats) -> Floats:
         """Nats (K,) that the loops `rows (K,)` gain if `seed` is right, given their log Bayes factors (K,): each place
