@@ -87,7 +87,7 @@ def _joins(votes: Votes, gain: Floats, count: int) -> tuple[Ints, Bools]:
     has_moved, base = np.zeros(count, bool), np.zeros(count, bool)
     for row in np.unique(first[first < len(real)]).tolist():
         for mover, other, lower in ((high[row], low[row], False), (low[row], high[row], True)):
-            if first[mover] == row and not (has_moved[mover] or base[mover] or has_moved[other]):
+            if first[mover] == row and not (base[mover] or has_moved[other]):
                 has_moved[mover] = base[other] = True
                 chosen.append(real[row])
                 moves_low.append(lower)

@@ -12,6 +12,7 @@ from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import MEDIAN_CHI2, has_unit_information, mean_variances
 from hodge_pipeline.complex.cycles import Loops
 from hodge_pipeline.solvers.backbone.levels import FEWEST, SIGMAS
+from hodge_pipeline.solvers.backbone.step_tests import LONGEST_CYCLE
 from hodge_pipeline.types import Bools, Floats, ViewGraph
 
 DEFAULT_ANGLE_RAD, DEFAULT_SHARE = 0.03, 0.05
@@ -21,8 +22,6 @@ ABOUT_A_POINT = 0.2
 """Least reach as a share of the usual step between views: where all turn about one point, nothing moves there."""
 FIRST_GATE_RAD, FIRST_GATE_SHARE = 0.35, 0.6
 """Gates of cycles that errors are estimated from; of translation as a share of the reach."""
-LONGEST_CYCLE = 4
-"""Most edges of those: errors of longer cycles add up until any seems to close."""
 SOME_CYCLES = 4
 """Fewest cycles to bound errors by where fewer than `FEWEST` close."""
 COPIES = 1e-5
@@ -84,7 +83,7 @@ def edge_noise(
         variances = mean_variances(there, graph.dimension == 2)
         own = [np.asarray(np.sqrt(np.where(each > 0, each, np.inf))) for each in variances]
     rotation, translation = map(_proportions, own)
-    short = np.flatnonzero(loops.lengths <= LONGEST_CYCLE)
+    short = np.flatnonzero(loops.lengths <= LONGEST_CYCLE + 1)  # errors of longer ones add up until any seems to close
     any_cycle, loops = len(loops) > 0, loops.select(short)
     turned, shifted = _Errors(loops, rotation, angle[short]), _Errors(loops, translation, displacement_m[short])
     step_m = float(np.median(np.linalg.norm(graph.i_from_j[:, :3, 3], axis=1))) if graph.edge_count else 0.0

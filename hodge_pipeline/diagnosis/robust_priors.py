@@ -10,7 +10,7 @@ from scipy.special import chdtri
 
 from hodge_pipeline import se3
 from hodge_pipeline.complex.chi2 import chi2_by_information, tail_gate, tail_weight
-from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS
+from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS, SIGMAS
 from hodge_pipeline.solvers.maximum_likelihood import solve
 from hodge_pipeline.solvers.priors import with_world
 from hodge_pipeline.solvers.reweighted import SETTLED
@@ -20,12 +20,6 @@ from hodge_pipeline.types.text import counted, suiting
 
 LEAST_SHARE = 0.01
 """Share of right priors beyond the gate, or one of all where that is less, as for edges."""
-MOST_WRONG = 0.5
-"""Share of the priors from which on nothing tells which are wrong: the edges may be."""
-MOST_EXCESS = 3.0
-"""Edges and priors may be off by so many times what they state. Edges are by at most 1.0 times in twenty graphs of the
-literature and of SLAM without wrong edges or with few, by 8 and 11 times in Bicocca's with most of its wrong loops.
-"""
 
 
 def right_priors(graph: ViewGraph, priors: Priors, solved: Callable[[ViewGraph], Floats]) -> Bools:
@@ -51,7 +45,7 @@ def right_priors(graph: ViewGraph, priors: Priors, solved: Callable[[ViewGraph],
         if np.abs(weights - before).max() < SETTLED:
             break
     right = scaled <= gate
-    return right if (~right).sum() < MOST_WRONG * (axes > 0).sum() else every
+    return right if 2 * (~right).sum() < (axes > 0).sum() else every  # else nothing tells which: the edges may be wrong
 
 
 def as_solved(graph: ViewGraph, priors: Priors) -> Priors:
@@ -117,7 +111,7 @@ def priors_told(graph: ViewGraph, kept: ViewGraph) -> tuple[tuple[str, ...], tup
     if wrong:
         contradict = f"{wrong} of {counted(tested, 'prior')} {suiting(wrong, 'contradicts|contradict')} the edges"
         findings.append(f"{contradict} and the others: {_farthest(graph, priors, right, poses)}")
-    if excess > MOST_EXCESS:
+    if excess > SIGMAS:
         findings.append(told)
     return (*notes, *dict.fromkeys((told, *findings))), tuple(findings)
 

@@ -27,8 +27,6 @@ LEAST_SPREAD_RAD = 0.2
 """Least spread of up: chained poses drift by as much, however upright the cameras were."""
 CLEAR_SHARE, CLEAR_SPREAD_RAD = 0.8, 0.42
 """The least share and the largest spread of a model that is used; else its share becomes 0."""
-STARTS = np.concatenate([np.eye(3), np.array([[0, 1, 1], [0, -1, 1]]) / np.sqrt(2)])
-"""Directions in camera axes from which the fit starts."""
 NEIGHBOURS = 12
 """Views of a group: few enough that nearly all groups are placed rightly."""
 
@@ -117,12 +115,12 @@ class Upright:
 
 def learn_upright(rotations: Floats, neighbours: Ints) -> Upright:
     """The most probable model of cameras (V, 3, 3) in groups (V,) of neighbours, by expectation and maximisation from
-    several starts; its share is 0 where the groups do not confirm it.
+    each axis of the camera; its share is 0 where the groups do not confirm it.
 
     Pieces may be placed wrongly, so that all cameras together fit none; and cameras that turn freely may fit one by
     chance. Groups of neighbours do neither.
     """
-    found = [_fitted_from(Upright(up, LEAST_SPREAD_RAD**-2 / 4, 0.5), rotations, neighbours) for up in STARTS]
+    found = [_fitted_from(Upright(up, LEAST_SPREAD_RAD**-2 / 4, 0.5), rotations, neighbours) for up in np.eye(3)]
     model = max(found, key=lambda each: each[0])[1]
     clear = model.share >= CLEAR_SHARE and model.concentration >= CLEAR_SPREAD_RAD**-2
     return model if clear else replace(model, share=0.0)

@@ -87,9 +87,7 @@ def _moves(here: Placements) -> list[Move]:
     rows = np.flatnonzero((agreeing == 0) & (i != j))
     rows = np.sort(rows[np.argsort(-evidence.weight[rows], kind="stable")[:MOST_PROPOSALS]])
     proposals = Proposals.of(evidence, here.found.poses, rows)
-    in_order = (np.abs(j - i) == 1) & (here.usual > 0)
     priority = PER_FOLD * np.log1p(np.asarray(proposals.alike.sum(axis=1)).ravel())
-    priority += np.where(in_order, np.log1p(evidence.weight), 0.0)[proposals.edge]
     turned = proposals.motion[:, :3, :3] @ here.found.poses[proposals.mover, :3, :3]
     priority += here.held(turned, here.up[proposals.stayer])
     tried = proposals.by_priority(priority, TRIED)

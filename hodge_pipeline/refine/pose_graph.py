@@ -17,11 +17,11 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.complex.conventions import inverted_notes
 from hodge_pipeline.diagnosis.options import DiagnosisOptions
 from hodge_pipeline.diagnosis.robust import solve_robust
-from hodge_pipeline.diagnosis.robust_priors import MOST_EXCESS
 from hodge_pipeline.errors import GraphError, SourceError, WorkspaceError
 from hodge_pipeline.pairs.edits import joining
 from hodge_pipeline.recipe.recipe_file import recipe_names
 from hodge_pipeline.solvers.backbone.credible import credible_steps
+from hodge_pipeline.solvers.backbone.levels import SIGMAS
 from hodge_pipeline.solvers.backbone.sequence import sequential_edges
 from hodge_pipeline.solvers.backbone.trust import AUTO
 from hodge_pipeline.solvers.explained import degrees_of_freedom
@@ -88,10 +88,10 @@ class SolvedFile:
             return "NOT proven to be the global minimum"
         if solution.converged is False:
             return "stopped before it converged"
-        if (excess := solution.metrics.get("priors_excess", 0.0)) > MOST_EXCESS:
+        if (excess := solution.metrics.get("priors_excess", 0.0)) > SIGMAS:
             return f"priors are off by {excess:.2g} times what they state"
         what = "edges and priors" if self._has_priors else "edges"
-        return f"{what} are off by {excess:.2g} times what they state" if (excess := self.excess) > MOST_EXCESS else ""
+        return f"{what} are off by {excess:.2g} times what they state" if (excess := self.excess) > SIGMAS else ""
 
     @property
     def _has_priors(self) -> bool:

@@ -12,7 +12,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from hodge_pipeline.solvers.backbone.chain import Chain
-from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, LARGEST, log_student
+from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, log_student
+from hodge_pipeline.solvers.backbone.levels import MOST_TRIED
 from hodge_pipeline.solvers.backbone.loop_places import corridors, one_of_each_place
 from hodge_pipeline.solvers.backbone.scales import Scales
 from hodge_pipeline.types import Floats, Ints
@@ -27,10 +28,6 @@ LARGE = 4.0
 """Prior standard deviation of a bias in those of a step: cycles over like many steps are closed by whole turns more."""
 FACTORS = 2.0 ** np.arange(2, -5, -1)
 """On the errors of steps: learned without a bias, they are so large that they explain it."""
-MOST_TURNED = 4
-"""Times that a path is turned: what cycles lack is linear in a bias that turns few of them by much. With 15, of 108
-biased graphs one of whose loops 75 are right has none confirmed.
-"""
 
 
 def without_bias(chain: Chain, scales: Scales) -> Chain | None:
@@ -42,7 +39,7 @@ def without_bias(chain: Chain, scales: Scales) -> Chain | None:
     rows = rows[one_of_each_place(scaled.places[rows])]
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_CYCLES)).astype(np.int64)]
     scaled = scaled.with_loops(rows, chain.ends[rows])
-    for _ in range(MOST_TURNED):
+    for _ in range(MOST_TRIED):  # what cycles lack is linear in a bias that turns few of them by much
         bias = _Cycles.of(scaled).surely()
         if not bias.any():
             break
@@ -71,14 +68,13 @@ class _Cycles:
     def of(cls, chain: Chain) -> _Cycles:
         """The cycles of a chain's loops, each on one path."""
         size, poses, (low, high) = chain.rotation_axes, chain.poses, chain.ends.T
-        measured = chain.inner & ~chain.bridged
         frame = poses[:, :size, :size] if size == 3 else np.ones((chain.size, 1, 1))
-        along = np.cumsum(np.where(measured[:, None, None], frame, 0.0), axis=0)
-        count = np.cumsum(measured)
+        along = np.cumsum(np.where(chain.measured[:, None, None], frame, 0.0), axis=0)
+        count = np.cumsum(chain.measured)
         of_step, of_loop = (
             np.einsum("nii->ni", each)[:, :size].mean(axis=1) for each in (chain.step_covariance, chain.covariance)
         )
-        variance = np.cumsum(np.where(measured, of_step, 0.0))
+        variance = np.cumsum(np.where(chain.measured, of_step, 0.0))
         shared = variance[np.minimum(high[:, None], high)] - variance[np.maximum(low[:, None], low)]
         lacks = chain.log(chain.between(chain.motion, chain.between(poses[low], poses[high])))[:, :size]
         return cls(
@@ -88,7 +84,7 @@ class _Cycles:
             np.maximum(shared, 0.0),
             of_loop,
             corridors(chain.places),
-            float(np.sqrt(np.median(of_step[measured]))),
+            float(np.sqrt(np.median(of_step[chain.measured]))),
         )
 
     def surely(self) -> Floats:
@@ -143,5 +139,4 @@ class _Cycles:
         size, variance = bias.shape[1], np.diag(self.shared) + self.own
         chi2 = (self._left(bias) ** 2).sum(axis=-1) / variance
         at_random = np.log(2 * np.pi) if size == 1 else np.log(4 / 3 * np.pi**4)
-        found = log_student(chi2, size) - 0.5 * size * np.log(variance) + at_random
-        return np.asarray(np.minimum(found, LARGEST))
+        return np.asarray(log_student(chi2, size) - 0.5 * size * np.log(variance) + at_random)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hodge_pipeline import se3
-from hodge_pipeline.complex.chi2 import FREEDOM, STUDENT_99, tail_weight
+from hodge_pipeline.complex.chi2 import STUDENT_99, tail_weight
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import mahalanobis, student_log_density
 from hodge_pipeline.solvers.backbone.fit import Fit
@@ -15,11 +15,6 @@ from hodge_pipeline.solvers.backbone.levels import MOST_ROUNDS, MOST_TRIED, NEAR
 from hodge_pipeline.solvers.backbone.linear import linearise, turned
 from hodge_pipeline.solvers.backbone.pairwise import PairwiseConsistency
 from hodge_pipeline.types import Bools, Floats, Ints
-
-LEAST_COST = 4.0
-"""Nats that the residual of a run must cost before its steps are tested: a limit on time; all runs of 20,000 poses take
-12 % more. With those of chance, 4.6, one of a hundred broken steps is missed, with the three costliest runs four.
-"""
 
 
 @dataclass(frozen=True)
@@ -40,7 +35,7 @@ class StepModel:
 
         Each step counts with its mirror image, since turns to the right are as usual as those to the left.
         """
-        rows = np.flatnonzero((chain.step_edge >= 0) & ~chain.bridged)
+        rows = np.flatnonzero(chain.measured)
         twist = chain.log(chain.step[rows])
         twist = np.concatenate([twist, twist @ _mirrored(chain, twist)])
         centre = np.median(twist, axis=0)
@@ -171,13 +166,11 @@ def unusual_breaks(usual: StepModel) -> list[Break]:
 class Runs:
     """Runs of steps between the ends of used loops, each tested against the solution without it.
 
-    - `pairwise`: of a chain whose loops are the motions of the runs at poses solved without each, in ascending order.
-    - `cost (S,)`: nats that the residual of each run costs.
+    `pairwise`: of a chain whose loops are the motions of the runs at poses solved without each, in ascending order.
     """
 
     pairwise: PairwiseConsistency
     usual: StepModel
-    cost: Floats
 
     @classmethod
     def of(cls, fit: Fit, poses: Floats, usual: StepModel) -> Runs:
@@ -187,9 +180,9 @@ class Runs:
         chain, used, linear = fit.linear.chain, fit.reduced, fit.linear
         low, high = used.ends[used.runs].T
         residual, total = fit.left_out(used.of_runs)
-        chi2, size = student_log_density(residual, total)[1], residual.shape[1]
-        tense = max(1.0, float(np.median(chi2)) / size)  # as if the steps' scale were too small by the usual run
-        log_density, chi2 = student_log_density(residual, tense * total)
+        usual_chi2 = float(np.median(mahalanobis(residual, total)[0]))
+        tense = max(1.0, usual_chi2 / residual.shape[1])  # as if the steps' scale were too small by the usual run
+        by_chain = student_log_density(residual, tense * total)[0]
         back = se3.inverse(turned(linear.poses[high]))
         ahead = chain.exp((chain.adjoint(back) @ residual[..., None])[..., 0])
         others = replace(
@@ -200,8 +193,7 @@ class Runs:
             covariance=chain.carried(back, tense * (total - fit.runs)),
         )
         none = np.zeros(len(low))
-        pairwise = PairwiseConsistency(linearise(others, poses), log_density, none, none > 0)
-        return cls(pairwise, usual, 0.5 * (FREEDOM + size) * np.log1p(chi2 / FREEDOM))
+        return cls(PairwiseConsistency(linearise(others, poses), by_chain, none, none > 0), usual)
 
     def score(self, at: Ints) -> Floats:
         """Nats (K,) by which a usual step to these positions is likelier than the measured one; ∞ outside all runs."""
@@ -214,15 +206,9 @@ class Runs:
         out[inside] = gain + self.usual.unusual[at]
         return out
 
-    def likeliest_break(self) -> Break | None:
-        """The likeliest broken step of runs whose residual costs more than `LEAST_COST`; None without such a run.
-
-        Many loops on either side hide a break from each other, not from the run between them.
-        """
-        costly = np.flatnonzero(self.cost > LEAST_COST)
-        if not len(costly):
-            return None
-        at = np.concatenate([np.arange(low + 1, high + 1) for low, high in self.pairwise.chain.ends[costly].tolist()])
+    def likeliest_break(self) -> Break:
+        """The likeliest broken step: many loops on either side hide it from each other, not from the run between."""
+        at = np.concatenate([np.arange(low + 1, high + 1) for low, high in self.pairwise.chain.ends.tolist()])
         score = self.score(at)
         run = int(np.searchsorted(self.pairwise.chain.ends[:, 1], at[np.argmax(score)]))
         return _break(self.pairwise, self.usual, run, at, score)

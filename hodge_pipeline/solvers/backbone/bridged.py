@@ -283,7 +283,7 @@ def _candidates(chain: Chain, found: Inferred) -> list[tuple[Break, float]]:
         runs = Runs.of(optimised(Fit(found.reduced, found.linear)), linear.poses, usual)
         of_run, scores = runs.likeliest_break(), runs.score(np.array([each.at for each in unlike], np.int64))
         unlike = [each for each, score in zip(unlike, scores, strict=True) if score > BY_CHANCE]
-        if of_run is not None and of_run.log_evidence > BY_CHANCE:
+        if of_run.log_evidence > BY_CHANCE:
             candidates.append((of_run, BY_CHANCE - of_run.log_evidence))
     candidates += [(each, max(least - each.log_evidence, BY_CHANCE)) for each in unlike]
     return candidates + [(each, least) for each in far[:1]]

@@ -78,6 +78,11 @@ class Chain:
         return np.asarray((self.step_edge >= 0) | self.bridged)
 
     @property
+    def measured(self) -> Bools:
+        """Positions (n,) that a step leads to which no bridge has replaced."""
+        return np.asarray((self.step_edge >= 0) & ~self.bridged)
+
+    @property
     def broken(self) -> Bools:
         """Positions (n,) that a broken step led to, where a bridge is."""
         return self.bridged & (self.step_edge >= 0)
@@ -103,7 +108,7 @@ class Chain:
     def turned(self, by: Floats) -> Chain:
         """The chain with a rotation (r,) more in each measured step."""
         twist = np.zeros((self.size, len(self.axes)))
-        twist[self.inner & ~self.bridged, : len(by)] = by
+        twist[self.measured, : len(by)] = by
         return replace(self, step=self.step @ self.exp(twist), bias=self.bias - by)
 
     @cached_property

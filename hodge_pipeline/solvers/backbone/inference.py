@@ -14,6 +14,7 @@ from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, EVEN, OutlierModel, mixture
 from hodge_pipeline.solvers.backbone.fit import Fit, Reduced, from_rotations, optimised, thinned
 from hodge_pipeline.solvers.backbone.judge import Judged, densities, judge
+from hodge_pipeline.solvers.backbone.levels import MOST_TRIED
 from hodge_pipeline.solvers.backbone.linear import Linear, linearise
 from hodge_pipeline.solvers.backbone.loop_places import one_of_each_place
 from hodge_pipeline.solvers.backbone.mistakes import Mistake, mistakes
@@ -101,7 +102,7 @@ class LoopJudge:
         found = self.best(chain, learned_scales(chain, self.outliers) if scales is None else [(scales, EVEN)])
         if scales is None and found is not None and not found.confirmed:
             found = self._by_likeliest_place(chain, found)
-        for _ in range(MOST_ANEW if scales is None else 0):
+        for _ in range(MOST_TRIED if scales is None else 0):
             if found is None or not found.confirmed:
                 break
             here = found.scales.at_solution(Fit(found.reduced, found.linear))
@@ -155,10 +156,6 @@ class LoopJudge:
         linear = replace(found.linear, chain=chain)
         judged = judge(linear, Fit(found.reduced, linear), EVEN, self.outliers)
         return bool(((_agreeing(judged) | self.trusted) != found.used).any())
-
-
-MOST_ANEW = 3
-"""Times that scales are learned anew, and that loops are judged as places are left out: limits on cost."""
 
 
 class _TooManyLoops(Exception):
@@ -253,7 +250,7 @@ class _Trial:
         shares, linear = rated.shares, rated.linear
         start, chain, trusted = self.start, self.start.chain, self.by.trusted
         fold = int(chain.broken.sum()) * float(np.log(chain.size))  # for the choice of the broken steps among all
-        for _ in range(MOST_ANEW):
+        for _ in range(MOST_TRIED):
             agreed, judged, linear = self.agreed(used | trusted, shares, linear)
             before, used, confirmed, of_places = used, agreed, False, -np.inf
             if not agreed.any() or (judged.factor[agreed] - np.log(agreed.sum())).sum() <= by_chance(int(agreed.sum())):

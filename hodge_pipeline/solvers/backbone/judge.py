@@ -79,16 +79,12 @@ def _through_ends(fit: Fit) -> Floats:
     linear, reduced, samples = fit.linear, fit.reduced, _samples(fit)
     chain, near, gap = linear.chain, [], np.zeros_like(linear.loops[1])
     for end in chain.ends.T:
-        right = np.clip(np.searchsorted(reduced.ends, end), 0, len(reduced.ends) - 1)
-        left = np.maximum(right - 1, 0)
-        distance = [
-            np.where(chain.path[reduced.ends[k]] == chain.path[end], np.abs(reduced.ends[k] - end), np.inf)
-            for k in (left, right)
-        ]
-        nearest = np.where(distance[0] < distance[1], left, right)
-        apart = np.isinf(np.minimum(*distance))
+        before = reduced.anchor[end]
+        after = np.minimum(before + 1, len(reduced.ends) - 1)
+        is_nearer = reduced.ends[after] - end <= np.abs(reduced.ends[before] - end)
+        nearest = np.where(is_nearer & (chain.path[reduced.ends[after]] == chain.path[end]), after, before)
         along = linear.path(end, reduced.ends[nearest], chain.ends[:, 1])
-        gap += np.where(apart[:, None, None], np.inf, along)
+        gap += np.where(reduced.touched[end, None, None], along, np.inf)
         near.append(nearest)
     pairs, of_loop = np.unique(np.stack(near), axis=1, return_inverse=True)
     first, second = reduced.ends[pairs]

@@ -5,7 +5,7 @@ from __future__ import annotations
 MOST_ROUNDS = 15
 """Rounds of an iteration that ends when it settles: a limit on cost."""
 MOST_TRIED = 3
-"""Candidates that are tried of each kind, the likeliest: a limit on cost."""
+"""Candidates that are tried of each kind, the likeliest, and times that a judgement is repeated: a limit on cost."""
 FEWEST = 10
 """Fewest values of which the median tells a scale, to a fifth."""
 NEARLY_ALL = 0.9

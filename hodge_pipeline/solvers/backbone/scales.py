@@ -208,8 +208,8 @@ def _upper_bounds(chain: Chain) -> Floats:
     rotations have no bound of their own, but `MOST_RATIO`: on a straight path their motion is small.
     """
     most = np.full(4, np.inf)
-    steps = (chain.step_edge >= 0) & ~chain.bridged
-    moved, spread = chain.log(chain.step[steps]), np.sqrt(np.einsum("mii->mi", chain.step_covariance[steps]))
+    moved = chain.log(chain.step[chain.measured])
+    spread = np.sqrt(np.einsum("mii->mi", chain.step_covariance[chain.measured]))
     for kind, axes in enumerate((slice(0, chain.rotation_axes), slice(chain.rotation_axes, None))):
         size, unit = np.linalg.norm(moved[:, axes]), np.linalg.norm(spread[:, axes])
         if size > 0 and unit > 0 and not (chain.stated and kind == 0):

@@ -46,7 +46,7 @@ def misstated_lengths(fitted: Chain, poses: Floats, used: Ints) -> list[StepLeng
     that were learned with a wrong length explain it. All loops together have to tell the same factor, within
     `SIGMAS` of its standard deviations: where loops or their errors are mistaken they tell one that is 3.5 to 6 off.
     """
-    measured = fitted.inner & ~fitted.bridged
+    measured = fitted.measured
     path = np.cumsum(fitted.step_edge < 0) - 1
     alone = [measured & (path == number) for number in np.unique(path[measured])]
     groups = [measured, *alone] if len(alone) > 1 else [measured]

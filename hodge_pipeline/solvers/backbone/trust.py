@@ -323,7 +323,7 @@ def _backbone(
     )
     steps = is_merged.copy()
     steps[chain.step_edge[chain.step_edge >= 0]] = True
-    used[chain.step_edge[chain.inner & ~chain.bridged]] = True
+    used[chain.step_edge[chain.measured]] = True
     used &= ~is_contradicted
     low, high = chain.spans(graph.edges[merged]).T
     broken = np.cumsum(chain.broken)

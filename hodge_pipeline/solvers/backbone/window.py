@@ -65,7 +65,7 @@ def windowed(given: Fused) -> Fused:
     weights, poses = _agreeing(learned, near, fits, scale, doubted)
     (of_step, of_near), agree = np.split(weights, [len(at)]), weights[len(at) :] > 0
     good = near[agree]
-    if len(good) < NEARLY_ALL * len(near) or not _many(chain, good):
+    if len(good) < NEARLY_ALL * len(near):
         return given
     replaced = (of_step == 0) & (chain.over(chain.ends[good]) > 0)[at]
     contradicted = np.concatenate([chain.step_edge[at[replaced]], chain.loop_edge[near[~agree]]])
@@ -88,13 +88,8 @@ def windowed(given: Fused) -> Fused:
 
 
 def _near(chain: Chain) -> Ints:
-    """Rows of the loops within a path over up to `STEPS_OF_PLACE` steps, or up to the longest window that at least
-    half of all positions have loops of each length of.
-    """
-    low, high = chain.ends.T
-    gap = np.where(chain.apart, chain.size, high - low)
-    rare = np.bincount(gap, minlength=chain.size)[2:] < 0.5 * chain.size
-    return np.flatnonzero(~chain.apart & (gap <= max(STEPS_OF_PLACE, 1 + int(np.argmax(np.append(rare, True))))))
+    """Rows of the loops within a path over up to `STEPS_OF_PLACE` steps."""
+    return np.flatnonzero(~chain.apart & (np.diff(chain.ends, axis=1)[:, 0] <= STEPS_OF_PLACE))
 
 
 def _many(chain: Chain, rows: Ints) -> bool:
