@@ -13,7 +13,6 @@ from scipy.linalg import cho_factor, cho_solve
 
 from hodge_pipeline.solvers.backbone.chain import Chain
 from hodge_pipeline.solvers.backbone.evidence import BY_CHANCE, log_student
-from hodge_pipeline.solvers.backbone.levels import MOST_TRIED
 from hodge_pipeline.solvers.backbone.loop_places import corridors, one_of_each_place
 from hodge_pipeline.solvers.backbone.scales import Scales
 from hodge_pipeline.types import Floats, Ints
@@ -28,6 +27,10 @@ LARGE = 4.0
 """Prior standard deviation of a bias in those of a step: cycles over like many steps are closed by whole turns more."""
 FACTORS = 2.0 ** np.arange(2, -5, -1)
 """On the errors of steps: learned without a bias, they are so large that they explain it."""
+MOST_TURNED = 4
+"""Times that a path is turned: what cycles lack is linear in a bias that turns few of them by much. With 3 or 15,
+of 108 biased graphs one of whose loops 75 are right has none confirmed.
+"""
 
 
 def without_bias(chain: Chain, scales: Scales) -> Chain | None:
@@ -39,7 +42,7 @@ def without_bias(chain: Chain, scales: Scales) -> Chain | None:
     rows = rows[one_of_each_place(scaled.places[rows])]
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_CYCLES)).astype(np.int64)]
     scaled = scaled.with_loops(rows, chain.ends[rows])
-    for _ in range(MOST_TRIED):  # what cycles lack is linear in a bias that turns few of them by much
+    for _ in range(MOST_TURNED):
         bias = _Cycles.of(scaled).surely()
         if not bias.any():
             break
