@@ -2,8 +2,8 @@
 
 Greedy merging can mistake a place for another that looks like it, and no single move then leads back. So a second start
 begins with the paths of consecutive views, which are wrong more rarely. Where every pair was tried, the local search
-begins at both, the pieces that result are merged on, and the solution with the larger log-evidence is taken. Elsewhere
-a third start begins with chordal poses of all edges, from which edges beyond the gate are dropped.
+begins at both, and the solution with the larger log-evidence is taken. Elsewhere a third start begins with chordal
+poses of all edges, from which edges beyond the gate are dropped.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from hodge_pipeline.complex.components import connected_components
 from hodge_pipeline.diagnosis.evidence import Evidence
 from hodge_pipeline.diagnosis.growth import Alignment, align
 from hodge_pipeline.diagnosis.placement import arrangement_log_evidence
-from hodge_pipeline.diagnosis.robust_poses import ANNEALED, GATE, LARGE, ONCE, TWICE, Solved, fit
+from hodge_pipeline.diagnosis.robust_poses import ANNEALED, GATE, LARGE, TWICE, Solved, fit
 from hodge_pipeline.diagnosis.scene_model import learn_scene_model
 from hodge_pipeline.diagnosis.search import LARGEST, searched
 from hodge_pipeline.types import Floats
@@ -55,7 +55,7 @@ def best_arrangement(evidence: Evidence, start: Solved) -> Solved:
         return start
     in_order = fit(evidence, _in_order(evidence), TWICE)
     starts = (start,) if np.array_equal(start.used, in_order.used) else (start, in_order)
-    found = [fit(evidence, align(evidence, searched(evidence, begun)), ONCE) for begun in starts]
+    found = [searched(evidence, begun) for begun in starts]
     models = [learn_scene_model(evidence, one) for one in found]
     values = [sum(arrangement_log_evidence(evidence, one, model) for model in models) for one in found]
     return found[int(np.argmax(values))]
