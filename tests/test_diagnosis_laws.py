@@ -202,6 +202,26 @@ def test_copies_of_edges_tell_nothing_of_how_exact_the_others_are() -> None:
     assert diagnose(graph).kept.all()
 
 
+@pytest.mark.parametrize("sigma", [None, 0.01, 0.1])
+@pytest.mark.parametrize("group", [1, 8])
+def test_edges_that_were_made_of_poses_do_not_excuse_wrong_ones(sigma: float | None, group: int) -> None:
+    """Cycles of near views close exactly; those of wrong edges that happen to close tell of no errors."""
+    count, rng = 40, np.random.default_rng(2)
+    near = near_pairs(count, 3)
+    begin = rng.integers(0, count - group, (104 // group, 2))
+    far = (begin[:, None] + np.arange(group)[:, None]).reshape(-1, 2)
+    edges = np.concatenate([near, far])
+    graph = measured(poses_on_a_ring(count), edges, noise=1e-5)
+    motions = graph.i_from_j.copy()
+    motions[len(near) :] = np.repeat(motions[rng.integers(0, len(near), len(begin))], group, axis=0)
+    graph = ViewGraph.from_edges(graph.vertex_ids, edges, motions)
+    if sigma is not None:
+        graph = replace(graph, information=np.tile(np.eye(6) / sigma**2, (len(edges), 1, 1)))
+    wrong = (np.arange(len(edges)) >= len(near)) & (np.abs(np.diff(edges, axis=1)[:, 0]) > 3)
+    found = diagnose(graph)
+    assert found.kept[: len(near)].all() and found.kept[wrong].sum() <= 2
+
+
 def test_information_that_explains_nearly_all_cycles_is_believed() -> None:
     """One edge in eight is as exact as the information says, the others a hundred times as exact."""
     poses, edges = poses_on_a_ring(40), near_pairs(40, 4)

@@ -90,11 +90,15 @@ def edge_noise(
     usual = DEFAULT_ANGLE_RAD, DEFAULT_SHARE * max(reach_m, ABOUT_A_POINT * step_m)
     stated = usual if not informed else (_median(rotation), _median(translation))
     credible = tuple(map(_credible, stated, usual, (turned.median_scale(), shifted.median_scale())))
-    turn = turned.scale(FIRST_GATE_RAD, prior, credible[0] if informed else usual[0])
-    shift = shifted.scale(FIRST_GATE_SHARE * reach_m, prior, credible[1] if informed else usual[1])
-    closes = (turned.error < FIRST_GATE_RAD) & (shifted.error < FIRST_GATE_SHARE * reach_m)
+    gates = FIRST_GATE_RAD, FIRST_GATE_SHARE * reach_m
+    unit = stated if informed else (1.0, 1.0)
+    turn, shift = (
+        each.scale(gate, prior, other if informed else own, own / by)
+        for each, gate, other, own, by in zip((turned, shifted), gates, credible, usual, unit, strict=True)
+    )
+    closes = (turned.error < gates[0]) & (shifted.error < gates[1])
     sound = (turned.ratio < SIGMAS) & (shifted.ratio < SIGMAS)
-    if informed and closes.sum() >= FEWEST and sound[closes].mean() >= COVERED:
+    if informed and not shifted.is_exact(gates[1]) and closes.sum() >= FEWEST and sound[closes].mean() >= COVERED:
         turn = max(turn, turned.covering_scale(sound, closes))
         shift = max(shift, shifted.covering_scale(sound, closes))
     if not informed:
@@ -154,16 +158,25 @@ class _Errors:
         self.loops, self.error = loops, error
         self.ratio = error / np.sqrt(loops.sums(relative**2))
 
-    def scale(self, gate: float, prior: Floats, fallback: float) -> float:
-        """The scale at which half of the cycles that close have an error below the median of its distribution."""
+    def is_exact(self, gate: float) -> bool:
+        """Whether more cycles of three edges and more close exactly, as where edges were made of poses, than others."""
+        closes = (self.error > COPIES * gate) & (self.error < gate)
+        return bool(((self.error <= COPIES * gate) & (self.loops.lengths > 2)).sum() > closes.sum())
+
+    def scale(self, gate: float, prior: Floats, fallback: float, usual: float) -> float:
+        """The scale at which half of the cycles that close have an error below the median of its distribution; at most
+        `usual` where most close exactly and the others hardly within the gate, as by chance.
+        """
         closes = (self.error > COPIES * gate) & (self.error < gate)
         if closes.sum() < FEWEST:
             return fallback
         weight = np.exp(self.loops.sums(np.log(prior)))[closes]
         order = np.argsort(self.ratio[closes])
         total = np.cumsum(weight[order])
-        median = float(self.ratio[closes][order][np.searchsorted(total, total[-1] / 2)])
-        return max(HEAVY_TAILS * median / MAXWELL_MEDIAN, 1e-3 * fallback)
+        middle = np.flatnonzero(closes)[order][np.searchsorted(total, total[-1] / 2)]
+        found = max(HEAVY_TAILS * float(self.ratio[middle]) / MAXWELL_MEDIAN, 1e-3 * fallback)
+        by_chance = max(self.error[middle], np.median(self.error[closes])) > gate / 2 and self.is_exact(gate)
+        return min(found, usual) if by_chance else found
 
     def median_scale(self) -> float:
         """The scale by the median of all cycles, 0 of fewer than `SOME_CYCLES`: hardly half of a few are wrong."""
