@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from clouds_data import cloud
 from hodge_adapters.clouds import columns as point_columns
+from hodge_adapters.clouds.columns import columns_called
 from hodge_adapters.clouds.fragments import Fragment, read_fragment
 from hodge_adapters.clouds.pcd import expand_lzf
 from hodge_adapters.clouds.ply import write_ply
@@ -203,3 +204,19 @@ def test_colours_in_text_have_the_bits_that_are_declared(tmp_path: Path, name: s
     (tmp_path / name).write_text(head + f"1 2 3 {stored}\n" * 2)
     found = CloudFolderReader().open(tmp_path).frames[0].read_points()
     assert found.colours.tolist() == [colour, colour]
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.pcd"])
+@pytest.mark.parametrize("colours", ["Red Green Blue", "R G B", "RED GREEN BLUE"])
+def test_names_of_columns_may_be_in_capitals(tmp_path: Path, name: str, colours: str) -> None:
+    head = COLOUR_HEADS[name].format("uchar", 1)
+    for word, named in zip(["x", "y", "z", "red", "green", "blue"], f"X Y Z {colours}".split(), strict=True):
+        head = head.replace(f" {word}", f" {named}")
+    (tmp_path / name).write_text(head + "1 2 3 0 1 1\n" * 2)
+    found = CloudFolderReader().open(tmp_path).frames[0].read_points()
+    assert found.points_in_cam.tolist() == [[1, 2, 3]] * 2
+    assert found.colours.tolist() == [[0, 1, 1]] * 2
+
+
+def test_a_column_that_has_the_very_name_keeps_it() -> None:
+    assert columns_called(["X", "x", "y", "z", "T", "b"]) == ["X", "x", "y", "z", "T", "blue"]

@@ -267,6 +267,19 @@ def test_calibrations_that_do_not_fit(tmp_path: Path) -> None:
     assert f"{INFO}: intrinsics of {2 * WIDTH}x{2 * HEIGHT} are scaled to the images' {WIDTH}x{HEIGHT}" in scaled.notes
 
 
+@pytest.mark.parametrize(
+    ("info", "frame", "doubted"), [(INFO, "other", 0), ("/b/info", OPTICAL, 0), ("/b/info", "other", 1)]
+)
+def test_the_calibration_of_another_camera_is_a_doubt(tmp_path: Path, info: str, frame: str, doubted: int) -> None:
+    log = Log()
+    log.add(info, CALIBRATION, {**foxglove_header(100, frame), **calibration(WIDTH, HEIGHT, 9, 9, 4, 3)}, CDR)
+    log.add(DEPTH, RAW, {**foxglove_header(100, OPTICAL), **some_images(1)[0]}, CDR)
+    source = McapReader().open(log.write(tmp_path / "log.mcap"))
+    assert source.frames[0].camera == Camera(WIDTH, HEIGHT, 9, 9, 4, 3)
+    told = f"{DEPTH} is of {OPTICAL}, and its intrinsics are from {info}, of {frame}: "
+    assert [str(doubt).startswith(told) for doubt in source.doubts] == [True] * doubted
+
+
 @pytest.mark.parametrize("height", [400, 0])
 def test_calibrations_of_another_shape_are_named(tmp_path: Path, height: int) -> None:
     log = Log()

@@ -84,6 +84,17 @@ def test_a_split_bag(tmp_path: Path) -> None:
     assert any("metadata.yaml cannot be read" in note for note in check_reader(McapReader(), tmp_path).notes)
 
 
+@pytest.mark.parametrize("suffix", [".mcap", ".bag"])
+def test_an_empty_file_costs_a_split_bag_nothing_else(tmp_path: Path, suffix: str) -> None:
+    """A recorder that is killed leaves its last file so."""
+    split_bag(tmp_path)
+    (tmp_path / f"bag_9{suffix}").touch()
+    (tmp_path / "metadata.yaml").write_text(metadata("bag_0.mcap", "bag_1.mcap", "bag_2.mcap", f"bag_9{suffix}"))
+    source = check_reader(McapReader(), tmp_path)
+    assert len(source.frames) == 3 and f"bag_9{suffix}: the file is empty" in source.notes
+    assert [note.kind for note in source.doubts] == ["recording incomplete"]
+
+
 @pytest.mark.parametrize(
     ("files", "remedy"),
     [

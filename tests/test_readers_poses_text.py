@@ -70,6 +70,17 @@ def test_decimal_commas_are_told_with_what_writes_points(tmp_path: Path, reader:
     assert len(guess_reader(path).open(path).trajectory) == 1
 
 
+@pytest.mark.parametrize("separator", [";", "; ", " ;\t"])
+def test_semicolons_separate_numbers_and_stay(tmp_path: Path, separator: str) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text("# a head; with one\n" + separator.join(["5.5", "1", "2", "3", "0", "0", "0", "1"]) + "\n")
+    read = guess_reader(path).open(path).trajectory
+    assert read.stamps_s.tolist() == [5.5] and read.world_from_cam[0, :3, 3].tolist() == [1, 2, 3]
+    (tmp_path / "out").mkdir()
+    line = TumRewriter().rewrite(tmp_path / "out", path, read).read_text().splitlines()[1]
+    assert line == separator.join(["5.5", "1.0", "2.0", "3.0", "0.0", "0.0", "0.0", "1.0"])
+
+
 @pytest.mark.parametrize(
     "head", ["# timestamp tx ty tz qw qx qy qz", "time,x,y,z,q_w,q_x,q_y,q_z", "# t q_RS_w q_RS_x"]
 )

@@ -93,6 +93,13 @@ def test_files_that_are_cut_are_refused(tmp_path: Path, name: str, cut: float) -
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("name", ["a.las", "a.laz", "a.e57"])
+def test_an_empty_file_is_told_to_be_copied_again(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).touch()
+    with pytest.raises(SourceError, match=rf"{name}: the file is empty: copy it again"):
+        CloudFolderReader().open(tmp_path / name).frames[0].read_points()  # type: ignore[misc]
+
+
 @pytest.mark.parametrize(("name", "package"), [("a.las", "laspy"), ("a.laz", "laspy"), ("a.e57", "pye57")])
 def test_the_package_that_is_needed_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, package: str

@@ -182,6 +182,15 @@ def test_bad_lines_are_left_out_and_noted(folder: Path) -> None:
     assert not any("secret" in str(file) for file in source.files)
 
 
+def test_lists_with_semicolons_are_read_as_those_with_blanks(folder: Path) -> None:
+    expected = TumReader().open(folder)
+    for name in ("depth.txt", "rgb.txt"):
+        (folder / name).write_text((folder / name).read_text().replace(" ", ";"))
+    found = TumReader().open(folder)
+    assert [frame.stamp_s for frame in found.frames] == [frame.stamp_s for frame in expected.frames]
+    assert colour_names(found) == colour_names(expected)
+
+
 def test_names_with_blanks_and_in_quotes(folder: Path) -> None:
     for name, own, other in (("rgb", "rgb/", "my rgb/"), ("depth", " depth/", ' "depth/')):
         text = (folder / f"{name}.txt").read_text().replace(own, other)

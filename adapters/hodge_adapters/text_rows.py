@@ -67,10 +67,17 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def rows_of(text: str) -> list[Row]:
-    """The lines that hold anything but a `#` comment, cut at blanks, tabs and commas."""
-    lines = text.splitlines()
-    cut = (Row(number, line.split("#", 1)[0].replace(",", " ").split()) for number, line in enumerate(lines, 1))
+    """The lines that hold anything but a `#` comment, cut at blanks, tabs and commas, or semicolons without a comma."""
+    lines = (line.split("#", 1)[0] for line in text.splitlines())
+    cut = (Row(number, line.replace(separator_of(line), " ").split()) for number, line in enumerate(lines, 1))
     return [row for row in cut if row.fields]
+
+
+def separator_of(line: str) -> str:
+    """What separates the fields of a line beside blanks: a semicolon only where there is no comma, which may be a
+    decimal point, as in `1,5;2,5`: such a line is not to look right.
+    """
+    return "," if "," in line else ";"
 
 
 def to_floats(fields: Sequence[str]) -> list[float] | None:

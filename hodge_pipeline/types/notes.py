@@ -61,10 +61,10 @@ DOUBTS = {
     "the camera in every direction, and no other edge tests the step.",
     "path scaled": "The refined path is {detail} times as large as the one given: depth and the given poses are of "
     "two scales, or depth is warped, and nothing here tells which is right.",
-    "given unlike": "The poses given miss {detail} of the registered motion (median), more than still ones would, and "
-    "no other convention explains them: are they of this camera, of these frames, and on their clock?",
-    "truth unlike": "The true poses miss {detail} of the registered motion (median), more than still ones would, and "
-    "no other convention or clock explains them: are they of this camera, and of these frames?",
+    "given unlike": "The poses given are off by {detail} times the registered motion (median), more than still ones "
+    "would be, and no other convention explains them: are they of this camera, of these frames, and on their clock?",
+    "truth unlike": "The true poses are off by {detail} times the registered motion (median), more than still ones "
+    "would be, and no other convention or clock explains them: are they of this camera, and of these frames?",
     "mostly untested": "{count} of {detail}.",
     "frames outside": "{count} of {detail} frames are from before the first given pose or after the last one: are they "
     "of another clock, or another path?",

@@ -17,6 +17,14 @@ from hodge_pipeline.types.positions import whole_kilometres
 
 NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 COLOURS = ("red", "green", "blue")
+OTHER_NAMES = {
+    "diffuse_red": "red",
+    "diffuse_green": "green",
+    "diffuse_blue": "blue",
+    "r": "red",
+    "g": "green",
+    "b": "blue",
+}
 PACKED = ("rgb", "rgba")
 """Colours of four bytes, 0xAARRGGBB, declared as a float by PCL's convention."""
 UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
@@ -78,6 +86,14 @@ def points_of_parts(path: Path, parts: Iterable[Columns], corner: Corner = ZERO)
         first_s=first_s,
         no_numbers=no_numbers,
     )
+
+
+def columns_called(names: Sequence[str]) -> list[str]:
+    """What columns are called here: those of coordinates, normals and colours have these names in any case and some
+    others (`X`, `diffuse_red`), unless another column has the name itself.
+    """
+    known = [OTHER_NAMES.get(name.lower(), name.lower()) for name in names]
+    return [ours if ours in NAMES and ours not in names else name for name, ours in zip(names, known, strict=True)]
 
 
 def is_time(name: str) -> bool:

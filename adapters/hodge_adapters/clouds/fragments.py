@@ -76,7 +76,7 @@ def fragments_of(files: list[Path], units_per_metre: float, notes: list[str]) ->
     corner = las_corner(las, units_per_metre, is_all=len(las) == len(files)) if las else None
     if corner is not None and any(corner):
         words = " ".join(f"{value:.0f}" for value in corner)
-        notes.append(f"coordinates of {len(las)} LAS files are counted from their middle {words}")
+        notes.append(f"coordinates of {counted(len(las), 'LAS file')} are counted from their middle {words}")
     far, step_m = _far_corner(others[0], units_per_metre) if others else (ZERO, 0.0)
     if step_m:
         notes.append(

@@ -15,6 +15,7 @@ from hodge_adapters.clouds.columns import (
     COLOURS,
     PACKED,
     as_declared,
+    columns_called,
     number_rows,
     parts_of,
     refuse_more,
@@ -96,6 +97,7 @@ def _read_header(path: Path, contents: bytes) -> PcdHeader:
         if words and not words[0].startswith("#"):
             entries[words[0]] = words[1:]
     names, sizes, kinds = (entries.get(key, []) for key in ("FIELDS", "SIZE", "TYPE"))
+    names = columns_called(names)
     counts = entries.get("COUNT") or ["1"] * len(names)
     points = entries.get("POINTS") or [_product(entries)]
     data = " ".join(entries["DATA"])

@@ -7,20 +7,11 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from hodge_adapters.clouds.columns import as_declared, number_rows, refuse_more
+from hodge_adapters.clouds.columns import COLOURS, as_declared, columns_called, number_rows, refuse_more
 from hodge_adapters.text_rows import reading, write_bytes_atomically
 from hodge_pipeline.types import Model, PointCloud
 from hodge_pipeline.types.input_files import open_input
 from hodge_pipeline.types.ply import PlyHeader, model_parts, read_header, vertex_parts
-
-COLOURS = {
-    "diffuse_red": "red",
-    "diffuse_green": "green",
-    "diffuse_blue": "blue",
-    "r": "red",
-    "g": "green",
-    "b": "blue",
-}
 
 
 def ply_parts(path: Path) -> Iterator[dict[str, Any]]:
@@ -38,8 +29,9 @@ def write_ply(path: Path, cloud: PointCloud) -> None:
 
 
 def _binary_parts(path: Path, file: BinaryIO, header: PlyHeader) -> Iterator[dict[str, Any]]:
+    names = [name for name, _ in header.properties]
     for records in vertex_parts(path, file, header):
-        yield {COLOURS.get(name, name): records[name] for name, _ in header.properties}
+        yield {called: records[name] for called, name in zip(columns_called(names), names, strict=True)}
 
 
 def _ascii_parts(path: Path, file: BinaryIO, header: PlyHeader) -> Iterator[dict[str, Any]]:
@@ -47,11 +39,11 @@ def _ascii_parts(path: Path, file: BinaryIO, header: PlyHeader) -> Iterator[dict
     for _ in islice(file, header.lines):
         pass
     lines = filter(bytes.strip, file)
-    for table in number_rows(path, lines, header.count, len(header.properties)):
+    names = columns_called([name for name, _ in header.properties])
+    for table in number_rows(path, lines, header.count, len(names)):
         columns = {}
-        for (name, code), column in zip(header.properties, table.T, strict=True):
-            called = COLOURS.get(name, name)
-            columns[called] = as_declared(column, code) if called in COLOURS.values() else column
+        for name, (_, code), column in zip(names, header.properties, table.T, strict=True):
+            columns[name] = as_declared(column, code) if name in COLOURS else column
         yield columns
     if header.is_last:
         refuse_more(path, lines, header.count)

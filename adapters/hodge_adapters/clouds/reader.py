@@ -73,7 +73,8 @@ class CloudFolderReader:
                 0.0, f"no {', '.join(ENDINGS)}", "a scan of another format: convert to PLY" if is_other else ""
             )
         return Sniff(
-            0.8 if count * 2 > len(names) else 0.4, f"{count} point clouds among {counted(len(names), 'file')}"
+            0.8 if count * 2 > len(names) else 0.4,
+            f"{counted(count, 'point cloud')} among {counted(len(names), 'file')}",
         )
 
     def open(self, path: Path) -> Source:

@@ -231,5 +231,8 @@ class _named:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         is_fault = isinstance(error, Exception) or type(error).__name__ == "PanicException"  # of laspy's Rust
         if is_fault and not isinstance(error, SourceError):
+            if self.path.is_file() and not self.path.stat().st_size:
+                raise SourceError(f"{self.path}: the file is empty: copy it again") from error
             words = " ".join(str(error).split())[:200] or type(error).__name__
-            raise SourceError(f"{self.path}: {self.package} cannot read it ({words}): convert it to PLY") from error
+            advice = "convert it to PLY, or copy it again if it is cut off"
+            raise SourceError(f"{self.path}: {self.package} cannot read it ({words}): {advice}") from error

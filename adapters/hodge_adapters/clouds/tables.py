@@ -8,8 +8,7 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
-from hodge_adapters.clouds.columns import NAMES, Columns, is_time, number_rows
-from hodge_adapters.clouds.ply import COLOURS
+from hodge_adapters.clouds.columns import NAMES, OTHER_NAMES, Columns, is_time, number_rows
 from hodge_adapters.text_rows import DECIMAL_ROW, first_text, reading, to_floats
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats
@@ -36,7 +35,7 @@ def table_parts(path: Path) -> Iterator[Columns]:
     for line in first_text(path).splitlines():
         fields, is_comment = fields_of(line), not is_row(line.encode())
         if fields and to_floats(fields[:1]) is None and not names and (not is_comment or {*"xyz"} <= {*fields}):
-            names, skipped = [COLOURS.get(name, name) for name in fields], skipped + (not is_comment)
+            names, skipped = [OTHER_NAMES.get(name, name) for name in fields], skipped + (not is_comment)
         elif not is_comment and len(fields) == 1 and fields[0].isdecimal() and said is None:
             said, skipped = int(fields[0][:18]), skipped + 1
         elif not is_comment:

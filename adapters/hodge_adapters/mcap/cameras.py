@@ -25,6 +25,7 @@ from hodge_adapters.text_rows import listed
 from hodge_pipeline import se3
 from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Camera, Floats
+from hodge_pipeline.types.notes import Note
 
 _BROWN_MODELS = frozenset(("", "plumb_bob", "rational_polynomial", "brown_conrady"))
 """Whose D is OpenCV's: four, five or, with a denominator, eight numbers."""
@@ -62,7 +63,7 @@ def second_cameras(
         }
         if shares_grid(depth, first) or not first.frame_id or not known:
             continue
-        own = find_camera(known, topic, first, "", [], undistort=undistort)
+        own = find_camera(known, topic, first, "", [], [], undistort=undistort)
         if own is None or _is_copy(own[0], depth_camera):
             continue
         same_axes = np.broadcast_to(np.eye(4), (1, 4, 4)) if first.frame_id == depth.frame_id else None
@@ -103,12 +104,13 @@ def find_camera(
     image: Seen[ImageLayout],
     calibration_topic: str,
     notes: list[str],
+    doubts: list[Note],
     *,
     undistort: bool,
 ) -> tuple[Camera, Lens | None] | None:
     """The camera of an image topic by its calibration, and its lens where images are to be undistorted; None, with
     notes, where none fits. One of another size is scaled where the shape is the same and its topic lies beside that of
-    the images.
+    the images. One of another camera, by its topic and its coordinate frame, is a doubt.
     """
     if calibration_topic:
         chosen, calibration = named_topic(known, calibration_topic, "calibration_topic")
@@ -143,6 +145,16 @@ def find_camera(
         )
 
     chosen = min(fitting, key=rank)
+    frames = image.frame_id, fitting[chosen].frame_id
+    if not is_beside(chosen, topic) and all(frames) and frames[0] != frames[1]:
+        doubts.append(
+            Note(
+                "reader's doubt",
+                detail=f"{topic} is of {frames[0]}, and its intrinsics are from {chosen}, of {frames[1]}: give those "
+                "of its camera with --set source.reader.camera=[fx,fy,cx,cy], or name the topic: "
+                "source.reader.calibration_topic",
+            )
+        )
     return _camera(chosen, fitting[chosen], topic, image.layout, undistort, notes)
 
 

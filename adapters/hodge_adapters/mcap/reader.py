@@ -99,7 +99,10 @@ class McapReader:
         listing = find_files(path, notes)
         recording = Recording(TransformTree(self.max_gap_s))
         for file in listing.logs:
-            recording.read_file(file)
+            if len(listing.logs) > 1 and not file.stat().st_size:
+                recording.complaints.loses(file, f"{file.name}: the file is empty")
+            else:
+                recording.read_file(file)
         notes += recording.complaints.notes()
         notes += filter(None, [recording.clock_note()])
         if recording.transforms.other_parents:
@@ -145,7 +148,7 @@ class McapReader:
         if kind == "points" and recording.clouds:
             return self._cloud_frames(recording, notes)
         if kind == "colour" and colour:
-            return self._colour_frames(recording, colour, notes)
+            return self._colour_frames(recording, colour, notes, doubts)
         if self.frames != "auto":
             raise SourceError(f"{path}: no {kind} in it (option frames): it has {_topics(recording)}")
         return [], ""
@@ -163,7 +166,7 @@ class McapReader:
         topic = named or best_depth(depth, colour, notes)
         images = one_per_stamp(topic, depth[topic], notes)
         before = len(notes)
-        found = self._camera(recording, topic, images[0], notes)
+        found = self._camera(recording, topic, images[0], notes, doubts)
         if found is None:
             reasons = [*notes[before:], *recording.complaints.counted(A_MESSAGE_WITH + NO_PINHOLE)]
             why = "".join(f"; {note}" for note in reasons)
@@ -229,20 +232,22 @@ class McapReader:
             )
         return cloud_frames(clouds), _coordinate_frame(topic, clouds, notes)
 
-    def _colour_frames(self, recording: Recording, colour: ImageTopics, notes: list[str]) -> tuple[list[Frame], str]:
+    def _colour_frames(
+        self, recording: Recording, colour: ImageTopics, notes: list[str], doubts: list[Note]
+    ) -> tuple[list[Frame], str]:
         topic = self._pick(colour, self.colour_topic, "colour_topic", notes)
         images = one_per_stamp(topic, colour[topic], notes)
-        camera, lens = self._camera(recording, topic, images[0], notes) or (None, None)
+        camera, lens = self._camera(recording, topic, images[0], notes, doubts) or (None, None)
         notes.append(f"frames are the images of {topic} alone: there is neither depth nor a point cloud")
         return colour_frames(images, camera, lens), _coordinate_frame(topic, images, notes)
 
     def _camera(
-        self, recording: Recording, topic: str, image: Seen[ImageLayout], notes: list[str]
+        self, recording: Recording, topic: str, image: Seen[ImageLayout], notes: list[str], doubts: list[Note]
     ) -> tuple[Camera, Lens | None] | None:
         if self.camera is not None:
             return checked(Intrinsics(*self.camera), "option camera").camera(image.layout.size), None
         return find_camera(
-            recording.calibrations, topic, image, self.calibration_topic, notes, undistort=self.undistort
+            recording.calibrations, topic, image, self.calibration_topic, notes, doubts, undistort=self.undistort
         )
 
     def _pick(self, topics: Mapping[str, Sequence[object]], name: str, what: str, notes: list[str]) -> str:

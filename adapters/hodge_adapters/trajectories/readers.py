@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from hodge_adapters.text_rows import first_text, to_floats
+from hodge_adapters.text_rows import first_text, separator_of, to_floats
 from hodge_adapters.trajectories.text import COLUMNS, decimal_commas, parse_tum, read_kitti
 from hodge_pipeline.stages import Sniff
 from hodge_pipeline.types import Source
@@ -64,7 +64,8 @@ def first_rows(path: Path) -> list[list[str]]:
 def _sniff_columns(path: Path, counts: tuple[int, ...], what: str) -> Sniff:
     if advice := decimal_commas(path):
         return Sniff(0.0, f"no {what}", advice)
-    rows = [to_floats(" ".join(row).replace(",", " ").split()) for row in first_rows(path)]
+    lines = map(" ".join, first_rows(path))
+    rows = [to_floats(line.replace(separator_of(line), " ").split()) for line in lines]
     rows = rows[1:] if rows and rows[0] is None else rows  # a head without a mark of comment
     good = sum(row is not None and len(row) in counts for row in rows)
     if not good or good < 0.8 * len(rows):

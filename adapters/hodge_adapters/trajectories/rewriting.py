@@ -17,7 +17,7 @@ from hodge_adapters.json_files import read_json, write_json
 from hodge_adapters.nerfstudio import opengl_matrix, transforms_file
 from hodge_adapters.open3d_json import Open3dReader, Open3dTrajectoryWriter
 from hodge_adapters.seven_scenes.files import FRAME_FILE, sequence_folders
-from hodge_adapters.text_rows import reading, to_floats, write_bytes_atomically, write_text_atomically
+from hodge_adapters.text_rows import reading, separator_of, to_floats, write_bytes_atomically, write_text_atomically
 from hodge_adapters.trajectories.euroc import NANO
 from hodge_adapters.trajectories.euroc import file_of as euroc_file
 from hodge_adapters.trajectories.text import COLUMNS, has_w_first, tum_stamps, unit_of
@@ -26,7 +26,6 @@ from hodge_pipeline.errors import SourceError
 from hodge_pipeline.types import Floats, Trajectory
 from hodge_pipeline.types.input_files import read_input
 
-_FIELD = re.compile(r"[^\s,]+")
 NO_OPTIONS = ConfigDict(extra="forbid")
 
 
@@ -186,7 +185,7 @@ def _rewritten(folder: Path, original: Path, numbers: Callable[[list[str]], list
     lines = []
     for line in contents[len(mark) :].decode("utf-8", "surrogateescape").splitlines(keepends=True):
         content = line.split("#", 1)[0]
-        spans = [match.span() for match in _FIELD.finditer(content)]
+        spans = [match.span() for match in re.finditer(rf"[^\s{separator_of(content)}]+", content)]
         new = numbers([content[slice(*span)] for span in spans]) if spans else None
         if new is not None:
             for (begin, end), value in reversed(list(zip(spans[first:], new, strict=False))):
