@@ -84,8 +84,8 @@ def _poses(graph: ViewGraph, found: Backbone | Diagnosis, judged: Diagnosis) -> 
 
 def errs_as_stated(graph: ViewGraph, found: Backbone | Diagnosis, kept: ViewGraph, solution: Solution) -> bool:
     """Whether the information of the kept edges explains what their maximum-likelihood solution leaves over, of all
-    together and of each, and the errors that were learned explain each: among stated ones far too large wrong edges are
-    not seen, which then bend the poses.
+    together and of each, and either the errors that were learned explain each, or none is far off for the usual one:
+    among stated errors far too large wrong edges are not seen, which then bend the poses.
     """
     poses = solution.world_from_cam
     if not (is_explained(kept, solution) and is_each_explained(kept, poses)):
@@ -93,10 +93,8 @@ def errs_as_stated(graph: ViewGraph, found: Backbone | Diagnosis, kept: ViewGrap
     if isinstance(found, Backbone):
         learned, steps = found.weighted(graph, correlated=False), found.steps[found.used]
     else:
-        learned, steps = (
-            replace(graph, information=found.information).select(found.kept),
-            np.zeros(kept.edge_count, bool),
-        )
+        learned = replace(graph, information=found.information).select(found.kept)
+        steps = np.zeros(kept.edge_count, bool)
     return is_each_explained(learned, poses) or is_each_usual(kept, poses, steps)
 
 

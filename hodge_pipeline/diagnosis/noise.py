@@ -85,20 +85,20 @@ def edge_noise(
     rotation, translation = map(_proportions, own)
     short = np.flatnonzero(loops.lengths <= LONGEST_CYCLE + 1)  # errors of longer ones add up until any seems to close
     any_cycle, loops = len(loops) > 0, loops.select(short)
-    turned, shifted = _Errors(loops, rotation, angle[short]), _Errors(loops, translation, displacement_m[short])
+    turned = _Errors(loops, rotation, angle[short], FIRST_GATE_RAD)
+    shifted = _Errors(loops, translation, displacement_m[short], FIRST_GATE_SHARE * reach_m)
     step_m = float(np.median(np.linalg.norm(graph.i_from_j[:, :3, 3], axis=1))) if graph.edge_count else 0.0
     usual = DEFAULT_ANGLE_RAD, DEFAULT_SHARE * max(reach_m, ABOUT_A_POINT * step_m)
     stated = usual if not informed else (_median(rotation), _median(translation))
     credible = tuple(map(_credible, stated, usual, (turned.median_scale(), shifted.median_scale())))
-    gates = FIRST_GATE_RAD, FIRST_GATE_SHARE * reach_m
-    unit = stated if informed else (1.0, 1.0)
-    turn, shift = (
-        each.scale(gate, prior, other if informed else own, own / by)
-        for each, gate, other, own, by in zip((turned, shifted), gates, credible, usual, unit, strict=True)
-    )
-    closes = (turned.error < gates[0]) & (shifted.error < gates[1])
+    if informed:
+        turn = turned.scale(prior, credible[0], usual[0] / stated[0])
+        shift = shifted.scale(prior, credible[1], usual[1] / stated[1])
+    else:
+        turn, shift = turned.scale(prior, usual[0], usual[0]), shifted.scale(prior, usual[1], usual[1])
+    closes = (turned.error < turned.gate) & (shifted.error < shifted.gate)
     sound = (turned.ratio < SIGMAS) & (shifted.ratio < SIGMAS)
-    if informed and not shifted.is_exact(gates[1]) and closes.sum() >= FEWEST and sound[closes].mean() >= COVERED:
+    if informed and not shifted.are_exact and closes.sum() >= FEWEST and sound[closes].mean() >= COVERED:
         turn = max(turn, turned.covering_scale(sound, closes))
         shift = max(shift, shifted.covering_scale(sound, closes))
     if not informed:
@@ -152,31 +152,33 @@ def _scaled(scale: float, proportions: Floats, stated: Floats) -> Floats:
 
 
 class _Errors:
-    """Closing errors of short cycles, `error (L,)`, and their `ratio (L,)` to those by the edges' relative noise."""
+    """Closing errors of short cycles, `error (L,)`, and their `ratio (L,)` to those by the edges' relative noise.
 
-    def __init__(self, loops: Loops, relative: Floats, error: Floats) -> None:
-        self.loops, self.error = loops, error
+    `closes (L,)`: within the `gate`, but for those that close exactly; `are_exact`: whether more cycles of three edges
+    and more close exactly than otherwise, as where edges were made of poses.
+    """
+
+    def __init__(self, loops: Loops, relative: Floats, error: Floats, gate: float) -> None:
+        self.loops, self.error, self.gate = loops, error, gate
         self.ratio = error / np.sqrt(loops.sums(relative**2))
+        exact = error <= COPIES * gate
+        self.closes = ~exact & (error < gate)
+        self.are_exact = bool((exact & (loops.lengths > 2)).sum() > self.closes.sum())
 
-    def is_exact(self, gate: float) -> bool:
-        """Whether more cycles of three edges and more close exactly, as where edges were made of poses, than others."""
-        closes = (self.error > COPIES * gate) & (self.error < gate)
-        return bool(((self.error <= COPIES * gate) & (self.loops.lengths > 2)).sum() > closes.sum())
-
-    def scale(self, gate: float, prior: Floats, fallback: float, usual: float) -> float:
+    def scale(self, prior: Floats, fallback: float, usual: float) -> float:
         """The scale at which half of the cycles that close have an error below the median of its distribution; at most
         `usual` where most close exactly and the others hardly within the gate, as by chance.
         """
-        closes = (self.error > COPIES * gate) & (self.error < gate)
-        if closes.sum() < FEWEST:
+        closes = np.flatnonzero(self.closes)
+        if len(closes) < FEWEST:
             return fallback
         weight = np.exp(self.loops.sums(np.log(prior)))[closes]
         order = np.argsort(self.ratio[closes])
         total = np.cumsum(weight[order])
-        middle = np.flatnonzero(closes)[order][np.searchsorted(total, total[-1] / 2)]
+        middle = closes[order[np.searchsorted(total, total[-1] / 2)]]
         found = max(HEAVY_TAILS * float(self.ratio[middle]) / MAXWELL_MEDIAN, 1e-3 * fallback)
-        by_chance = max(self.error[middle], np.median(self.error[closes])) > gate / 2 and self.is_exact(gate)
-        return min(found, usual) if by_chance else found
+        by_chance = max(self.error[middle], np.median(self.error[closes])) > self.gate / 2
+        return min(found, usual) if by_chance and self.are_exact else found
 
     def median_scale(self) -> float:
         """The scale by the median of all cycles, 0 of fewer than `SOME_CYCLES`: hardly half of a few are wrong."""

@@ -61,7 +61,7 @@ def _cycles(graph: ViewGraph, backbone: Backbone, in_loop: Bools) -> tuple[Cycle
     """
     chain = backbone.chain
     low, high = chain.ends.T
-    torn = np.cumsum(~np.append(in_loop, False)[chain.step_edge])
+    torn = np.cumsum(chain.lacks(in_loop) | (chain.step_edge < 0))
     same = torn[low] == torn[high]
     order = np.flatnonzero(same)[np.argsort((high - low)[same], kind="stable")]
     order = order[np.cumsum((high - low)[order] + 1) <= MOST_ENTRIES]

@@ -25,8 +25,7 @@ def is_explained(graph: ViewGraph, solution: Solution) -> bool:
 
 def is_each_explained(graph: ViewGraph, world_from_cam: Floats) -> bool:
     """Whether the largest χ² of an edge at poses (V, 4, 4) is one that chance reaches among as many edges."""
-    chi2 = chi2_by_information(graph, world_from_cam)
-    size = len(PLANAR_AXES) if dimension_of(graph) == 2 else 6
+    chi2, size = _chi2(graph, world_from_cam)
     return bool(chi2.max(initial=0.0) <= chdtri(size, LEAST_SHARE / max(len(chi2), 1)))
 
 
@@ -34,13 +33,17 @@ def is_each_usual(graph: ViewGraph, world_from_cam: Floats, steps: Bools) -> boo
     """Whether the largest χ² of the `steps (E,)` at poses (V, 4, 4), and of the other edges, is one that chance reaches
     by errors of which the median of each is the usual one.
     """
-    chi2 = chi2_by_information(graph, world_from_cam)
-    size = len(PLANAR_AXES) if dimension_of(graph) == 2 else 6
+    chi2, size = _chi2(graph, world_from_cam)
     for each in (chi2[steps], chi2[~steps]):
         each = each[each > EXACT * each.max(initial=0.0)]
         if len(each) and each.max() > np.median(each) / MEDIAN_CHI2[size] * chdtri(size, LEAST_SHARE / len(chi2)):
             return False
     return True
+
+
+def _chi2(graph: ViewGraph, world_from_cam: Floats) -> tuple[Floats, int]:
+    """The χ² (E,) of the edges at poses (V, 4, 4), and how many axes it has."""
+    return chi2_by_information(graph, world_from_cam), len(PLANAR_AXES) if dimension_of(graph) == 2 else 6
 
 
 LEAST_SHARE = 0.01

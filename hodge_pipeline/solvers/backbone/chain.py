@@ -82,6 +82,10 @@ class Chain:
         """Positions (n,) that a step leads to which no bridge has replaced."""
         return np.asarray((self.step_edge >= 0) & ~self.bridged)
 
+    def lacks(self, kept: Bools) -> Bools:
+        """Positions (n,) that a step leads to which is not among the edges `kept (E,)`."""
+        return np.asarray(~np.append(kept, True)[self.step_edge])
+
     @property
     def broken(self) -> Bools:
         """Positions (n,) that a broken step led to, where a bridge is."""

@@ -44,7 +44,7 @@ def left_out_steps(graph: ViewGraph, kept: Bools) -> tuple[int, int]:
     chain = make_chain(graph, sequential_edges(graph))
     ends = np.unique(chain.ends[kept[chain.loop_edge]], axis=0)  # of 20,000 copies of a loop all are pairs
     short = ends[np.diff(ends, axis=1)[:, 0] <= LONGEST_CYCLE]
-    left_out = ~np.append(kept, True)[chain.step_edge]
+    left_out = chain.lacks(kept)
     across = pairs_across(ends, left_out | ~chain.inner)[1]
     uncontradicted = left_out & (chain.over(np.concatenate([short, across])) == 0)
     return int(left_out.sum()), int(uncontradicted.sum())

@@ -129,7 +129,7 @@ class Backbone:
         """
         against, shifts, chain = edges & ~self.used, 0, self.chain
         if self.found.confirmed:
-            torn = np.cumsum(~np.append(edges, True)[chain.step_edge])
+            torn = np.cumsum(chain.lacks(edges))
             against[chain.loop_edge] &= np.not_equal(*torn[chain.ends].T) | chain.apart
         for each in self.found.mistakes():
             rows = chain.loop_edge[each.rows]
